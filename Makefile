@@ -121,6 +121,7 @@ figures: bench
 	$(PYTHON) benchmark/export_mujoco.py cantilever hanging flexcomp minute
 	$(PYTHON) benchmark/export_mujoco.py trials $(if $(MEASURED),--other)
 	$(PYTHON) benchmark/capture.py
+	if [ -n "$(MEASURED)" ]; then $(PYTHON) benchmark/mistakes.py; fi
 	$(PYTHON) benchmark/first_day.py
 	if ! pkg-config --exists ignition-physics5 sdformat12 2>/dev/null; then
 	  echo 'Gazebo Fortress is not installed: the table export_sdf is not made again.'

@@ -61,8 +61,7 @@ setup(
     maintainer_email='dlo_calibration@example.org',
     license='Apache-2.0',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
-    package_data={NAME: ['py.typed', 'files/schema/*.xsd', 'page/static/*', 'report/page.html',
-                         'simulation/core/*.pyi']},
+    package_data={NAME: ['py.typed', '**/*.pyi', 'files/schema/*.xsd', 'page/static/*', 'report/page.html']},
     data_files=shared_files(),
     cmdclass={'build_ext': Build},
     ext_modules=[Extension(
@@ -71,7 +70,10 @@ setup(
         language='c++', extra_link_args=MORE_FLAGS, extra_compile_args=[
             '-std=c++17', '-O3', '-g0', '-fvisibility=hidden', '-Wno-psabi',
             # The same bits on every processor: no fused or reordered operations.
-            '-ffp-contract=off', '-fno-math-errno', '-fno-trapping-math', *MORE_FLAGS])],
+            '-ffp-contract=off', '-fno-math-errno', '-fno-trapping-math',
+            # GCC 12 vectorizes to fused operations in spite of the above; lanes are vectors already.
+            '-fno-tree-vectorize',
+            *MORE_FLAGS])],
     zip_safe=False,
     python_requires='>=3.11',
     # The lower bounds are what Ubuntu 24.04 ships, so that a Jazzy machine keeps its own packages.

@@ -26,15 +26,16 @@ import numpy as np
 
 HERE = Path(__file__).resolve().parent
 COMMAND = [sys.executable, '-m', 'dlo_calibration']
-MOCAP_FIT = '0,8,16,24,32,40,48,54'  # spread over the session: which ones are fitted makes a difference
+MOCAP_FIT = '0,8,16,24,32,40,48,54'  # spread over the session, because the choice matters
 MOCAP_OTHER = '42,43,44,45,46,47,49,50,51,52,53,55'
 WIRE = 1.5  # m
+ENVIRONMENT = {**os.environ, 'PYTHONPATH': str(HERE.parent)}
 
 
 def convert(kind: str, source: str, output: Path, *arguments: str) -> Path:
     """Make a session with convert.py."""
     subprocess.run([sys.executable, str(HERE / 'convert.py'), kind, source, str(output), *arguments],
-                   check=True, stdout=subprocess.DEVNULL)
+                   check=True, stdout=subprocess.DEVNULL, env=ENVIRONMENT)
     return output
 
 
@@ -51,16 +52,16 @@ def validate(result: Path, session: Path, *arguments: str) -> dict[str, Any]:
 def command(*arguments: str) -> dict[str, Any]:
     """Return the JSON document that a verb prints."""
     done = subprocess.run([*COMMAND, *arguments, '--json'], check=True, stdout=subprocess.PIPE,
-                          env={**os.environ, 'PYTHONPATH': str(HERE.parent)})
+                          env=ENVIRONMENT)
     document: dict[str, Any] = json.loads(done.stdout)
     return document
 
 
 def estimate(fitted: dict[str, Any], name: str) -> str:
     """Return one parameter as a cell of a table."""
-    found = fitted['parameters'][name]
-    text = f'{found["value"]:.1f} ± {found["std"]:.1f}'
-    return text if found['identifiable'] else f'({text})'
+    parameter = fitted['parameters'][name]
+    text = f'{parameter["value"]:.1f} ± {parameter["std"]:.1f}'
+    return text if parameter['identifiable'] else f'({text})'
 
 
 def reference(folder: Path, options: list[str]) -> str:
@@ -107,12 +108,12 @@ def hanging(folder: Path, options: list[str]) -> str:
         last = convert('hanging', wire, folder / f'{wire}_other', '--repeats', '4')
         fitted = fit(session, folder / f'{wire}_fit', *options)
         other = validate(folder / f'{wire}_fit', last)
-        percents = [100 * one['rms_error_m'] / WIRE for one in (fitted, other)]
+        percents = [100 * document['rms_error_m'] / WIRE for document in (fitted, other)]
         stiffness = []
         for repeat in '01234':
             session = convert('hanging', wire, folder / f'{wire}_{repeat}', '--repeats', repeat)
-            one = fit(session, folder / f'{wire}_{repeat}_fit', *options)
-            stiffness.append(one['parameters']['flexibility']['physical_value'])
+            single = fit(session, folder / f'{wire}_{repeat}_fit', *options)
+            stiffness.append(single['parameters']['flexibility']['physical_value'])
         spread = 100 * float(np.std(stiffness) / np.mean(stiffness))
         sections.append(
             f'## {wire}\n\n{table("repeats", fitted, other)}\n\n'
@@ -127,15 +128,15 @@ def table(what: str, fitted: dict[str, Any], other: dict[str, Any]) -> str:
     """Tabulate a fit and its validation."""
     rows = [f'| {what} | trials | mean_abs_error_m | mean_error_m | rms_error_m | max_error_m '
             '| error_percent_of_length | seconds |', '|' + '---|' * 8]
-    for name, one in (('fitted', fitted), ('other', other)):
+    for name, document in (('fitted', fitted), ('other', other)):
         keys = ('mean_abs_error_m', 'mean_error_m', 'rms_error_m', 'max_error_m')
-        rows.append(f'| {name} | {one["trials"]} | ' + ' | '.join(f'{one[key]:.5f}' for key in keys)
-                    + f' | {one["error_percent_of_length"]:.3f} | {one["seconds"]:.0f} |')
+        rows.append(f'| {name} | {document["trials"]} | ' + ' | '.join(f'{document[key]:.5f}' for key in keys)
+                    + f' | {document["error_percent_of_length"]:.3f} | {document["seconds"]:.0f} |')
     rows.append('')
-    for name, found in fitted['parameters'].items():
-        rows.append(f'- {name} {estimate(fitted, name)}: {found["physical_value"]:.3g} '
-                    f'{found["physical_unit"]} ({found["physical_lower"]:.3g} to '
-                    f'{found["physical_upper"]:.3g})')
+    for name, parameter in fitted['parameters'].items():
+        rows.append(f'- {name} {estimate(fitted, name)}: {parameter["physical_value"]:.3g} '
+                    f'{parameter["physical_unit"]} ({parameter["physical_lower"]:.3g} to '
+                    f'{parameter["physical_upper"]:.3g})')
     return '\n'.join(rows)
 
 

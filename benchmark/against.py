@@ -50,7 +50,7 @@ def alone(simulator, jobs):
         except SimulationError:
             pass
 
-found = {}
+figures = {}
 trials = [trial for name in sys.argv[2:] for trial in read_session(f'{sys.argv[1]}/{name}').trials]
 for physics, fixed in (('', {}), (', all cable physics', {
         'torsion': 40.0, 'natural_curvature': 20.0, 'bending_friction': 60.0, 'bending_slip': 50.0})):
@@ -65,15 +65,15 @@ for physics, fixed in (('', {}), (', all cable physics', {
         begun = time.thread_time()
         for portion in portions:
             call(simulator, portion)
-        found[f'rollout, {name}{physics}, ms'] = 1e3 * (time.thread_time() - begun) / len(jobs)
+        figures[f'rollout, {name}{physics}, ms'] = 1e3 * (time.thread_time() - begun) / len(jobs)
     if stoppable:
         for threads in (1, 2):
             with ThreadPoolExecutor(threads) as pool:
                 begun = time.perf_counter()
                 list(pool.map(lambda portion: together(simulator, portion), portions))
-                found[f'rollout, {threads} threads{physics}, ms'] = (
+                figures[f'rollout, {threads} threads{physics}, ms'] = (
                     1e3 * (time.perf_counter() - begun) / len(jobs))
-print(json.dumps(found))
+print(json.dumps(figures))
 """
 FIT = ('', '--search random --evaluations 600')
 
@@ -117,9 +117,10 @@ def proportional(parent):
     family, total = {parent}, 0.0
     while more := {child for child, its in parents.items() if its in family} - family:
         family |= more
-    for one in family:
+    for member in family:
         try:
-            total += int(re.search(r'^Pss:\s+(\d+)', Path(f'/proc/{one}/smaps_rollup').read_text(), re.M)[1])
+            rollup = Path(f'/proc/{member}/smaps_rollup').read_text()
+            total += int(re.search(r'^Pss:\s+(\d+)', rollup, re.M)[1])
         except OSError:
             pass
     return total / 1024
@@ -143,19 +144,19 @@ def main():
     here, other = HERE.parent, parser.parse_args().other.resolve()
     figures = {folder: {} for folder in (other, here)}
     for _ in range(ROUNDS):
-        for folder, found in figures.items():
+        for folder, series in figures.items():
             now = rollouts(folder)
             for words in FIT:
                 seconds, memory = fit(folder, words)
                 now[' '.join(f'fit SESSION {words}, printed, s'.split())] = seconds
                 now[' '.join(f'fit SESSION {words}, memory, MB'.split())] = memory
             for name, figure in now.items():
-                found.setdefault(name, []).append(figure)
+                series.setdefault(name, []).append(figure)
         sys.stderr.write('.')
         sys.stderr.flush()
     before, after = ({name: min(all_of) for name, all_of in figures[folder].items()} for folder in figures)
-    ratios = {name: statistics.median(a / b for a, b in zip(found, figures[here][name], strict=True))
-              for name, found in figures[other].items()}
+    ratios = {name: statistics.median(a / b for a, b in zip(series, figures[here][name], strict=True))
+              for name, series in figures[other].items()}
     rows = [[name, f'{before[name]:.2f}' if name in before else '-', f'{figure:.2f}',
              f'{ratios[name]:.2f}' if name in ratios else '-'] for name, figure in after.items()]
     write('against', f'python benchmark/against.py OTHER, a checkout of {revision(other)}',

@@ -32,21 +32,21 @@ OBJECTS = tuple(f'object{k}' for k in range(1, 6))
 RANDOM = ('flexibility', 'elasticity', 'friction', 'damping')
 NEVER_TOUCHES = 1e-9  # m
 SHARES = (1e-10, -1e-10, 1e-9, -1e-9, 1e-8)  # by which the friction is changed
-SAME = 1e-3  # m: a point that is further off than that is elsewhere
+SAME = 1e-3  # m; a point with a larger distance is elsewhere
 
 
 def reference_trials() -> list[tuple[str, float, Trial]]:
     """Return object, mass [kg] and trial."""
-    found = []
+    reference = []
     for name in OBJECTS:
         if DATA.is_dir():
             properties, trials = exact_trials(name)
-            found += [(name, properties['mass'], trial) for trial in trials]
+            reference += [(name, properties['mass'], trial) for trial in trials]
         else:
             session = read_session(SAMPLES / name)
             options = session.options
-            found += [(name, options.mass, trial) for trial in session.trials]
-    return found
+            reference += [(name, options.mass, trial) for trial in session.trials]
+    return reference
 
 
 def cases(count: int, seed: int) -> Iterator[tuple[str, Trial, dict[str, float], float]]:
@@ -79,18 +79,18 @@ def difference(engines: tuple[Simulator, Simulator], trial: Trial, physical: dic
 
 
 def own_spread(engine: Simulator, trial: Trial, physical: dict[str, float]) -> float:
-    """Return how far an engine's points move at most [m] if the friction changes by one of SHARES."""
+    """Return the largest displacement of an engine's points [m] if the friction changes by one of SHARES."""
     chains = engine.simulate(trial, physical).chains
     return max(float(np.linalg.norm(engine.simulate(
         trial, {**physical, 'friction': physical['friction'] * (1 + share)}).chains - chains, axis=-1).max())
         for share in SHARES)
 
 
-def cells(found: list[Floats]) -> list[object]:
+def cells(distances: list[Floats]) -> list[object]:
     """Return mean, 99th percentile and worst [mm], trials with a point elsewhere, and failed ones."""
-    points = 1e3 * np.concatenate(found)
+    points = 1e3 * np.concatenate(distances)
     return [f'{points.mean():.2g}', f'{np.percentile(points, 99):.2g}', f'{points.max():.2g}',
-            sum(one.max(initial=0) > SAME for one in found), sum(not len(one) for one in found)]
+            sum(each.max(initial=0) > SAME for each in distances), sum(not len(each) for each in distances)]
 
 
 def main() -> None:
@@ -101,29 +101,30 @@ def main() -> None:
     parser.add_argument('--seed', type=int, default=1)
     arguments = parser.parse_args()
     engines = BulletSimulator(), CompiledSimulator()
-    apart: dict[str, list[Floats]] = {}
+    separate: dict[str, list[Floats]] = {}
     touching: dict[str, list[Floats]] = {}
     worst: list[tuple[float, int, str, Trial, dict[str, float]]] = []
     for number, (name, trial, physical, radius) in enumerate(
             cases(arguments.trials, arguments.seed), start=1):
-        for kind, found, one in (('without', apart, physical),
-                                 ('with', touching, {**physical, 'self_collision': radius})):
-            distances = difference(engines, trial, one)
-            found.setdefault(name, []).append(distances)
+        for kind, series, parameters in (('without', separate, physical),
+                                         ('with', touching, {**physical, 'self_collision': radius})):
+            distances = difference(engines, trial, parameters)
+            series.setdefault(name, []).append(distances)
             what = f'{name}, {trial.name}, {kind}'
-            worst.append((float(distances.max(initial=0)), number, what, trial, one))
-    worst.sort(key=lambda one: -one[0])
-    spreads = [[number, what, *(f'{one[key]:.2g}' for key in (*RANDOM, 'self_collision')), f'{1e3 * far:.2g}',
-                *(f'{1e3 * own_spread(engine, trial, one):.2g}' for engine in engines)]
-               for far, number, what, trial, one in worst[:6] if np.isfinite(far)]
+            worst.append((float(distances.max(initial=0)), number, what, trial, parameters))
+    worst.sort(key=lambda case: -case[0])
+    spreads = [[number, what, *(f'{parameters[key]:.2g}' for key in (*RANDOM, 'self_collision')),
+                f'{1e3 * far:.2g}',
+                *(f'{1e3 * own_spread(engine, trial, parameters):.2g}' for engine in engines)]
+               for far, number, what, trial, parameters in worst[:6] if np.isfinite(far)]
     engines[0].close()
     columns = ['objects', 'self-contact', 'trials', 'mean, mm', '99th percentile, mm', 'worst, mm',
                'trials with a point beyond 1 mm', 'failed in both']
-    rows = [[label, kind, sum(len(found[name]) for name in names),
-             *cells([one for name in names for one in found[name]])]
+    rows = [[label, kind, sum(len(series[name]) for name in names),
+             *cells([distances for name in names for distances in series[name]])]
             for label, names in (('all', OBJECTS), *((name, (name,)) for name in OBJECTS))
-            for kind, found in (('without', apart), ('with', touching))
-            if all(name in found for name in names)]
+            for kind, series in (('without', separate), ('with', touching))
+            if all(name in series for name in names)]
     text = [table(columns, rows),
             'The worst, and how far each engine is from itself where the friction changes by '
             f'{min(SHARES, key=abs):g} to {max(SHARES):g} of its value (the largest of {len(SHARES)} '

@@ -41,58 +41,58 @@ def seconds() -> float:
 
 def judge(seed: int) -> dict[str, Any]:
     """Trace one photograph; return its figures."""
-    one = scene(seed)
-    pixels = photograph(one.camera, one.curve, one.radius, one.look, seed)
-    found: dict[str, Any] = {'name': one.name, 'clicks': len(one.clicks)}
+    drawn = scene(seed)
+    pixels = photograph(drawn.camera, drawn.curve, drawn.radius, drawn.look, seed)
+    figures: dict[str, Any] = {'name': drawn.name, 'clicks': len(drawn.clicks)}
     try:
         begun = seconds()
         tracer = Tracer(pixels)
-        trace = tracer.trace(one.clicks)
-        found['first'] = seconds() - begun
-        again = one.clicks.copy()
+        trace = tracer.trace(drawn.clicks)
+        figures['first'] = seconds() - begun
+        again = drawn.clicks.copy()
         again[len(again) // 2] += 1.0
         begun = seconds()
         tracer.trace(again)
-        found['again'] = seconds() - begun
+        figures['again'] = seconds() - begun
     except InputError as error:
-        return {**found, 'refused': str(error)}
-    points, off = distances(one, trace.pixels)
-    return {**found, 'mean': 1e3 * points.mean(), 'worst': 1e3 * points.max(), 'off': off, 'sure': trace.sure,
-            'inner': 1e3 * points[1:-1].mean(), 'across': 1e3 * off.mean()}
+        return {**figures, 'refused': str(error)}
+    points, off = distances(drawn, trace.pixels)
+    return {**figures, 'mean': 1e3 * points.mean(), 'worst': 1e3 * points.max(), 'off': off,
+            'sure': trace.sure, 'inner': 1e3 * points[1:-1].mean(), 'across': 1e3 * off.mean()}
 
 
 def tables(figures: list[dict[str, Any]]) -> str:
     """Return the summary and the table of all photographs."""
-    good = [one for one in figures if 'refused' not in one]
-    off, sure = (np.concatenate([one[name] for one in good]) for name in ('off', 'sure'))
-    means = np.array([one['mean'] for one in good])
+    good = [shown for shown in figures if 'refused' not in shown]
+    off, sure = (np.concatenate([shown[name] for shown in good]) for name in ('off', 'sure'))
+    means = np.array([shown['mean'] for shown in good])
     bad = off > FAR
     rows = [
         ('photographs, traced', f'{len(figures)}, {len(good)}'),
         ('mean distance of 21 points from the truth, mm', f'{means.mean():.2f}'),
         ('median photograph, worst photograph, mm', f'{np.median(means):.2f}, {means.max():.2f}'),
-        ('worst point, mm', f'{max(one["worst"] for one in good):.2f}'),
+        ('worst point, mm', f'{max(shown["worst"] for shown in good):.2f}'),
         ('mean distance of the line from the DLO, across it, mm', f'{1e3 * off.mean():.2f}'),
         ('share of the line that says it is not sure', f'{100 * (~sure).mean():.1f}%'),
         (f'share off by more than {1e3 * FAR:g} mm, and of this not sure',
          f'{100 * bad.mean():.1f}%, {100 * (~sure[bad]).mean() if bad.any() else 100:.0f}%'),
         ('not sure where it is nearer than that', f'{100 * (~sure[~bad]).mean():.1f}%'),
         ('first trace with preparation, mean and longest, s of one core',
-         f'{np.mean([one["first"] for one in good]):.2f}, {max(one["first"] for one in good):.2f}'),
+         f'{np.mean([shown["first"] for shown in good]):.2f}, {max(shown["first"] for shown in good):.2f}'),
         ('after another click, mean and longest, s of one core',
-         f'{np.mean([one["again"] for one in good]):.2f}, {max(one["again"] for one in good):.2f}')]
-    each = []
-    for one in figures:
-        if 'refused' in one:
-            each.append((one['name'], one['clicks'], 'refused', '', '', '', '', ''))
+         f'{np.mean([shown["again"] for shown in good]):.2f}, {max(shown["again"] for shown in good):.2f}')]
+    photographs = []
+    for shown in figures:
+        if 'refused' in shown:
+            photographs.append((shown['name'], shown['clicks'], 'refused', '', '', '', '', ''))
         else:
-            distance = (f'{one[name]:.2f}' for name in ('mean', 'worst', 'across'))
-            unsure = f'{100 * (~one["sure"]).mean():.0f}%'
-            times = (f'{one[name]:.2f}' for name in ('first', 'again'))
-            each.append((one['name'], one['clicks'], *distance, unsure, *times))
+            distance = (f'{shown[name]:.2f}' for name in ('mean', 'worst', 'across'))
+            unsure = f'{100 * (~shown["sure"]).mean():.0f}%'
+            times = (f'{shown[name]:.2f}' for name in ('first', 'again'))
+            photographs.append((shown['name'], shown['clicks'], *distance, unsure, *times))
     columns = ('photograph', 'clicks', 'mean, mm', 'worst point, mm', 'across, mm', 'not sure', 'first, s',
                'again, s')
-    return f'{table(("figure", "value"), rows)}\n\n{table(columns, each)}'
+    return f'{table(("figure", "value"), rows)}\n\n{table(columns, photographs)}'
 
 
 def main() -> None:
@@ -104,7 +104,7 @@ def main() -> None:
     import cv2
 
     cv2.setNumThreads(1)
-    judge(0)  # loads what is loaded once
+    judge(0)  # loads libraries
     text = tables([judge(options.seed + k) for k in range(options.amount)])
     how = ('Rendered photographs of 12 megapixels.  An end that is seen obliquely looks longer than the '
            'axis, by up to half a radius.')

@@ -165,9 +165,9 @@ def hanging_trials(repeats: Floats, length: float) -> Trials:
         grips = held(len(goal), {0: 1, 1: 1, len(goal) - 2: 2, len(goal) - 1: 2})
 
         around = np.linspace(0, np.pi, SWING_STEPS + 1)[:, None]
-        apart = measured[-1] - measured[0]
-        swing = abs(apart[0]) * np.hstack([np.cos(around), np.sin(around), 0 * around])
-        swing[:, 2:] += around / np.pi * apart[2]
+        offset = measured[-1] - measured[0]
+        swing = abs(offset[0]) * np.hstack([np.cos(around), np.sin(around), 0 * around])
+        swing[:, 2:] += around / np.pi * offset[2]
         last = measured[0] + np.concatenate([[[length, 0.0, 0.0]], swing])
         times = np.append(0.0, APPROACH_TIME + SWING_TIME * np.linspace(0, 1, len(swing)))
         yield (
@@ -196,10 +196,10 @@ def write_session(output: Path, trials: Trials, options: Mapping[str, Any]) -> t
 def _chosen(indices: str, count: int, name: str) -> list[int]:
     """Return indices given as ``0,3,7`` or ``all``."""
     try:
-        chosen = list(range(count)) if indices == 'all' else [int(one) for one in indices.split(',')]
+        chosen = list(range(count)) if indices == 'all' else [int(index) for index in indices.split(',')]
     except ValueError:
         chosen = []
-    if not chosen or not all(0 <= one < count for one in chosen):
+    if not chosen or not all(0 <= index < count for index in chosen):
         raise InputError(f'--{name}', repr(indices), f'indices from 0 to {count - 1}, or all', 'correct them')
     return chosen
 
@@ -253,12 +253,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             ('reference', '--actions', 'fitted', 'fitted, other, all, or names with commas'),
             ('mocap', '--recordings', '0', 'indices with commas, or all'),
             ('hanging', '--repeats', 'all', 'indices with commas, or all')):
-        one = kinds.add_parser(kind)
-        one.add_argument('source', help='name of the object, cable or wire')
-        one.add_argument('output', type=Path, help='folder to make')
-        one.add_argument(option, default=default, help=f'{says} (default: {default})')
+        verb = kinds.add_parser(kind)
+        verb.add_argument('source', help='name of the object, cable or wire')
+        verb.add_argument('output', type=Path, help='folder to make')
+        verb.add_argument(option, default=default, help=f'{says} (default: {default})')
         if kind == 'mocap':
-            one.add_argument('--every', type=int, default=1, help='every how manieth frame is a goal')
+            verb.add_argument('--every', type=int, default=1, help='N: every Nth frame is a goal')
     given = parser.parse_args(arguments)
     name, read = SOURCES[given.kind]
     file = given.data / given.kind / name.format(given.source)

@@ -36,13 +36,13 @@ def exact_trials(name: str) -> tuple[dict[str, float], list[Trial]]:
     """Return the properties and the nine noiseless trials of an object."""
     document = json.loads((DATA / f'{name}.json').read_text())
     trials = []
-    for one in document['trials']:
+    for recorded in document['trials']:
         hands = tuple(Hand(f'hand{k}', (hand['grip_index'],), [knot['t'] for knot in hand['knots']],
                            [knot['position'] for knot in hand['knots']])
-                      for k, hand in enumerate(one['hands']))
-        held = () if one['release'] else tuple(hand.name for hand in hands)
-        trials.append(Trial(one['action'], Chain(one['initial_exact']), (Action(hands),),
-                            (Goal(Chain(one['goal_exact']), one['goal_time'], held_by=held),)))
+                      for k, hand in enumerate(recorded['hands']))
+        held = () if recorded['release'] else tuple(hand.name for hand in hands)
+        trials.append(Trial(recorded['action'], Chain(recorded['initial_exact']), (Action(hands),),
+                            (Goal(Chain(recorded['goal_exact']), recorded['goal_time'], held_by=held),)))
     return document['properties'], trials
 
 

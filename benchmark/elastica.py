@@ -17,10 +17,9 @@ from __future__ import annotations
 from dataclasses import replace
 import os
 from pathlib import Path
-import subprocess
-import sys
 import tempfile
 
+from accuracy import convert
 import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_bvp
@@ -60,7 +59,7 @@ class Elastica:
         angles = np.unwrap(np.arctan2(segments[:, 1], segments[:, 0]))
         theta = np.interp(self._places, (self._places[1:] + self._places[:-1]) / 2, angles)
         self._turn = 2 * np.pi * round(float(theta[-1]) / (2 * np.pi))
-        self._known = self._places, np.vstack([*points.T, theta, np.gradient(theta, self._places)]), GUESS
+        self._solution = self._places, np.vstack([*points.T, theta, np.gradient(theta, self._places)]), GUESS
 
     def residuals(self, stiffness: float, length: float) -> Floats:
         """Return solved minus measured coordinates, (2 n,) [m]; the next solution starts from this one."""
@@ -72,20 +71,21 @@ class Elastica:
         def ends(first: Floats, last: Floats, _: Floats) -> Floats:
             return np.array([*first[:3], *(last[:2] - self._points[-1]), last[2] - self._turn])
 
-        places, shape, force = self._known
+        places, shape, force = self._solution
         solved = solve_bvp(slope, ends, places, shape, p=force, tol=TOLERANCE, max_nodes=20000)
         if not solved.success:
             raise RuntimeError(solved.message)
-        self._known = solved.x, solved.y, solved.p
+        self._solution = solved.x, solved.y, solved.p
         return np.asarray((solved.sol(self._places)[:2].T - self._points).ravel())
 
     def fit(self, length: float) -> tuple[float, float, float]:
         """Return stiffness [N m^2], length [m], and the root mean square distance [m]."""
         stiffnesses = np.geomspace(STIFFEST, STIFFEST / 30, STEPS)
-        costs = [float(np.square(self.residuals(float(one), length)).sum()) for one in stiffnesses]
-        for one in stiffnesses[::-1]:  # back to the best, so that the fit starts beside a solution
-            self.residuals(float(one), length)
-            if one >= stiffnesses[int(np.argmin(costs))]:
+        costs = [float(np.square(self.residuals(float(stiffness), length)).sum())
+                 for stiffness in stiffnesses]
+        for stiffness in stiffnesses[::-1]:  # back to the best, so that the fit starts beside a solution
+            self.residuals(float(stiffness), length)
+            if stiffness >= stiffnesses[int(np.argmin(costs))]:
                 break
         start = [np.log(stiffnesses[int(np.argmin(costs))]), length]
         best = least_squares(lambda q: self.residuals(float(np.exp(q[0])), float(q[1])), start,
@@ -100,8 +100,8 @@ def simulated(session: Path, nodes: int) -> tuple[float, float, float]:
     evaluator = Evaluator(read.trials, options.space, CompiledSimulator(table=False, nodes=nodes))
     search = LeastSquares(2, 1, Hints.at(np.array([0.55, 0.5])))
     while len(points := search.ask(100)):
-        found = [evaluator.evaluate(0, point) for point in points]
-        search.tell([Observation(one.point, one.score, one.residuals) for one in found])
+        search.tell([Observation(evaluation.point, evaluation.score, evaluation.residuals)
+                     for evaluation in (evaluator.evaluate(0, point) for point in points)])
     assert search.best is not None
     best = evaluator.evaluate(0, search.best)
     assert best.errors is not None
@@ -116,16 +116,15 @@ def main() -> None:
         with np.load(DATA / 'hanging' / f'{wire}.npz') as source:
             points = source['points'][0][:, [0, 2]].astype(float)
             length, weight = float(source['length_m']), float(source['mass_per_m']) * GRAVITY
-        found = [('elastica', *Elastica(points - points[0], weight).fit(length))]
+        fits = [('elastica', *Elastica(points - points[0], weight).fit(length))]
         with tempfile.TemporaryDirectory() as folder:
             session = Path(folder) / wire
-            subprocess.run([sys.executable, str(HERE / 'convert.py'), 'hanging', wire, str(session),
-                            '--repeats', '0'], check=True, stdout=subprocess.DEVNULL)
+            convert('hanging', wire, session, '--repeats', '0')
             for nodes in NODES:
                 stiffness, scale, error = simulated(session, nodes)
-                found.append((f'{nodes} nodes', stiffness, scale * length, error))
+                fits.append((f'{nodes} nodes', stiffness, scale * length, error))
         rows += [f'| {wire} | {by} | {stiffness:.3g} | {long:.4f} | {100 * error / length:.2f} |'
-                 for by, stiffness, long, error in found]
+                 for by, stiffness, long, error in fits]
     text = '# elastica\n\n`python benchmark/elastica.py`\n\n' + '\n'.join(rows) + '\n'
     print(text)
     (HERE / 'results' / 'elastica.md').write_text(text)

@@ -14,11 +14,11 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
-import subprocess
 import sys
 import tempfile
 import time
 
+from accuracy import convert
 import numpy as np
 
 HERE = Path(__file__).resolve().parent
@@ -38,13 +38,13 @@ def rows(name: str, path: Path, truth: dict[str, float]) -> list[str]:
     options, trials = session.options, session.trials
     space = ParameterSpace(free=tuple(truth), mass=options.mass)
     start = time.perf_counter()
-    found = prior_estimates(trials, space, options.table_top)
+    estimates = prior_estimates(trials, space, options.table_top)
     seconds = time.perf_counter() - start
     table = []
-    for key, one in found.items():
-        value = '-' if np.isnan(one.value) else f'{one.value:.1f}'
+    for key, estimate in estimates.items():
+        value = '-' if np.isnan(estimate.value) else f'{estimate.value:.1f}'
         table.append(f'| {name} | {key} | {BY_NAME[key].value(truth[key]):.1f} | {value} '
-                     f'| {one.lower:.1f} to {one.upper:.1f} |')
+                     f'| {estimate.lower:.1f} to {estimate.upper:.1f} |')
     print(f'{name}: {seconds * 1e3:.0f} ms')
     return table
 
@@ -59,9 +59,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for name in ('white', 'black'):
             session = Path(folder) / name
-            subprocess.run([sys.executable, str(HERE / 'convert.py'), 'hanging', name, str(session)],
-                           check=True, stdout=subprocess.DEVNULL,
-                           env={**os.environ, 'PYTHONPATH': str(HERE.parent)})
+            convert('hanging', name, session)
             with np.load(DATA / 'hanging' / f'{name}.npz') as wire:
                 published = float(np.median(wire['published_EI']))
             table += rows(f'{name} wire', session, {'flexibility': published})

@@ -6,30 +6,24 @@ Repeat the paper's experiment on the reference objects, judged by five actions t
 
     python benchmark/experiment.py [--runs N] [--output DIR]
 
-The sessions are made from the measured data, which DLO_DATA names.  Calibrations that DIR
-has already are not repeated.  The tables are written to benchmark/results/experiment_other.md.
+The sessions are made from the measured data, which DLO_DATA names.  Calibrations that are
+already in DIR are not repeated.  The tables are written to benchmark/results/experiment_other.md.
 """
 
 from __future__ import annotations
 
 import argparse
-import os
 from pathlib import Path
 import subprocess
 import sys
 import tempfile
 
+from accuracy import convert, ENVIRONMENT
+
 HERE = Path(__file__).resolve().parent
 #: The trials of a session of the other actions, as convert.py orders them.
 OTHER = ('place_middle', 'hold_end', 'place_three_quarters', 'drag_end', 'fold')
 OBJECTS = tuple(f'object{k}' for k in range(1, 6))
-
-
-def convert(name: str, output: Path, actions: str) -> Path:
-    """Make a session with convert.py."""
-    subprocess.run([sys.executable, str(HERE / 'convert.py'), 'reference', name, str(output),
-                    '--actions', actions], check=True, stdout=subprocess.DEVNULL)
-    return output
 
 
 def main() -> None:
@@ -41,13 +35,13 @@ def main() -> None:
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
-        fitted = [convert(name, folder / name, 'fitted') for name in OBJECTS]
-        other = [convert(name, folder / f'{name}_other', ','.join(OTHER)) for name in OBJECTS]
+        fitted = [convert('reference', name, folder / name) for name in OBJECTS]
+        other = [convert('reference', name, folder / f'{name}_other', '--actions', ','.join(OTHER))
+                 for name in OBJECTS]
         done = subprocess.run(
             [sys.executable, '-m', 'dlo_calibration', 'experiment', *map(str, fitted), '--validate-on',
              *map(str, other), '--runs', arguments.runs, '--output', str(arguments.output)],
-            check=True, stdout=subprocess.PIPE, text=True,
-            env={**os.environ, 'PYTHONPATH': str(HERE.parent)})
+            check=True, stdout=subprocess.PIPE, text=True, env=ENVIRONMENT)
     text = done.stdout.replace(f'{folder}/', '')
     print(text)
     command = (f'Trials 1 to 5: {", ".join(OTHER)}.  Made by `python benchmark/experiment.py '

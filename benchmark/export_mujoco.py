@@ -4,7 +4,7 @@
 """
 Compare an exported DLO in MuJoCo with the elastica, with this package's engine and with the measured chains.
 
-    python benchmark/export_mujoco.py [cantilever] [hanging] [flexcomp] [trials] [minute] [--other]
+    python benchmark/export_mujoco.py [PART ...] [--other]
 
 Each part is printed, and written to benchmark/results/export_mujoco_V_PART.md, where V is 3 or 4, the
 version of the MuJoCo that is installed:
@@ -12,6 +12,8 @@ version of the MuJoCo that is installed:
 - cantilever: a horizontal one, whose first body is fixed, against the elastica from the middle of that body;
   beside it our engine, whose first segment is clamped, against the elastica from the end of that segment;
 - hanging: a DLO that hangs from its first body, against what EA and the weight make it longer;
+- pin: a DLO that hangs from a hand by a `connect` constraint, and how far below the hand it is;
+- speed: simulated seconds in a second of processor time, of a DLO on a table, in the air, and coiled;
 - flexcomp: the same two, of MuJoCo's own deformable, which export does not write;
 - trials: each sample is calibrated, and its trials are replayed. Hands are mocap bodies, and a `connect`
   constraint between a hand and the site of a gripped point is active while the hand is closed. The DLO counts
@@ -27,12 +29,11 @@ from dataclasses import replace
 from functools import partial
 from itertools import product
 from pathlib import Path
-import subprocess
-import sys
 import tempfile
 import time
 from typing import Any, Iterator
 
+from accuracy import convert
 import figures
 from lxml import etree
 import mujoco
@@ -66,13 +67,19 @@ STRETCHES = (4.0, 90.0)  # EA, N
 DRAG = 4.0  # 1/s, so that what hangs comes to rest soon
 RADIUS, FLEX_SEGMENTS, FLEX_STIFFNESSES = 0.004, 40, (1e-3, 2e-2)  # m, -, N m^2, of flexcomps
 EDGES = {'': 'as documented', 'solref="0.004 1" solimp="0.99 0.9999 0.001"': 'stiff'}
+SOLREFS = ('0.02 1', '0.01 1', '0.004 1')  # of a pin; the first is MuJoCo's default, the last as trials have
+COIL, PITCH = 0.04, 2.2  # m, radii of the DLO; of a coil that falls on the table
 LONGEST = 6.0  # s, to wait for a stable DLO
 #: Part -> what its table is, and the columns.
 PARTS = {
     'cantilever': ('Distance of the tip of a cantilever from the elastica, mm.', [
-        'EI, N m^2', 'mass, g', *(f'{one} segments' for one in SEGMENTS), '% of the length, 40',
+        'EI, N m^2', 'mass, g', *(f'{count} segments' for count in SEGMENTS), '% of the length, 40',
         'ours, 40 segments', 'EI, mass of']),
     'hanging': ('By how much a hanging DLO becomes longer.', ['EA, N', 'MuJoCo, mm', 'EA and weight, mm']),
+    'pin': ('How far a DLO of 0.6 m that hangs from a `connect` constraint is below its hand, 40 segments.', [
+        'solref', 'mass, g', 'EA, N', 'below the hand, mm']),
+    'speed': ('Simulated seconds in a second of processor time, sample 1, in its second second.', [
+        'nodes', 'where', 'contacts', 'extensible', 'inextensible']),
     'flexcomp': ("A flexcomp of one dimension instead, 40 edges, Young's modulus from EI: it has no EA.", [
         'EI, N m^2', 'edges', 'tip of a cantilever from the elastica, mm', 'longer by its weight, mm']),
     'trials': ('Mean distance of the points, mm.', [
@@ -87,9 +94,10 @@ def made_up(bending: float, stretching: float, mass: float) -> Description:
     """Return a DLO with given EI [N m^2], EA [N] and mass [kg]."""
     sample = read_result(figures.SAMPLES / 'xml/dlo.xml')
     values = {'flexibility': bending, 'elasticity': stretching}
-    found = {name: replace(one, value=BY_NAME[name].value(values[name])) if name in values else one
-             for name, one in sample.parameters.items()}
-    return replace(sample, parameters=found, mass=mass,
+    parameters = {
+        name: replace(parameter, value=BY_NAME[name].value(values[name])) if name in values else parameter
+        for name, parameter in sample.parameters.items()}
+    return replace(sample, parameters=parameters, mass=mass,
                    fixed={**sample.fixed, 'damping': BY_NAME['damping'].value(DRAG)})
 
 
@@ -112,11 +120,11 @@ def started(text: str) -> tuple[Any, Any]:
     return model, state
 
 
-def at_rest(found: Description, direction: Floats, segments: int) -> Floats:
+def at_rest(dlo: Description, direction: Floats, segments: int) -> Floats:
     """Return the points, (POINTS, 3) [m], of a DLO that was fixed straight in a direction and let fall."""
     chain = Chain(np.linspace(0, LENGTH, POINTS)[:, None] * direction)
     options = Options(nodes=segments + 1, table=False)
-    model, state = started(fixed(export_mjcf(found, chain, options=options)))
+    model, state = started(fixed(export_mjcf(dlo, chain, options=options)))
     mujoco.mj_step(model, state, round(FALL / model.opt.timestep))
     before = points_of(model, state)
     mujoco.mj_step(model, state, round(0.1 / model.opt.timestep))
@@ -129,8 +137,8 @@ def at_rest(found: Description, direction: Floats, segments: int) -> Floats:
 def points_of(model: Any, state: Any) -> Floats:
     """Return the sites at the points of the chain, (n, 3) [m]."""
     names = (f'dlo_point_{k}' for k in range(model.nsite))
-    found = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, name) for name in names]
-    return np.array(state.site_xpos[[one for one in found if one >= 0]])
+    sites = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, name) for name in names]
+    return np.array(state.site_xpos[[site for site in sites if site >= 0]])
 
 
 def cantilevers() -> Iterator[list[str]]:
@@ -142,7 +150,7 @@ def cantilevers() -> Iterator[list[str]]:
                 tip = at_rest(made_up(bending, 1e4, mass), np.array([1.0, 0, 0]), segments)[-1]
                 away.append(np.linalg.norm(tip - elastica(bending, LENGTH / segments / 2, mass)))
             ours = ours_away(bending, mass, 40)
-            yield [f'{bending:g}', f'{1e3 * mass:g}', *(f'{1e3 * one:.2f}' for one in away),
+            yield [f'{bending:g}', f'{1e3 * mass:g}', *(f'{1e3 * each:.2f}' for each in away),
                    f'{100 * away[SEGMENTS.index(40)] / LENGTH:.2f}', f'{1e3 * ours:.2f}', name]
 
 
@@ -194,24 +202,63 @@ def stretches() -> Iterator[list[str]]:
         yield [f'{stretching:g}', f'{1e3 * longer:.2f}', f'{1e3 * expected:.2f}']
 
 
-def with_hands(text: str, held: list[Grip]) -> str:
+def pins() -> Iterator[list[str]]:
+    """Yield the rows of the table of pins."""
+    chain = Chain(np.linspace(0, LENGTH, POINTS)[:, None] * [0, 0, -1.0])
+    for solref, mass, stretching in product(SOLREFS, (MASS, 10 * MASS), (300.0,)):
+        text = export_mjcf(made_up(1e-4, stretching, mass), chain, options=Options(table=False))
+        held = Grip(0, np.array([0.0, 2 * FALL]), np.zeros((2, 3)))
+        model, state = started(with_hands(text, [held], solref))
+        state.eq_active[:] = 1
+        mujoco.mj_step(model, state, round(FALL / model.opt.timestep))
+        assert not state.warning.number.any(), 'MuJoCo warns that it is unstable'
+        yield [solref, f'{1e3 * mass:g}', f'{stretching:g}', f'{-1e3 * points_of(model, state)[0, 2]:.2f}']
+
+
+def speeds() -> Iterator[list[str]]:
+    """Yield the rows of the table of speeds."""
+    dlo = read_result(figures.SAMPLES / 'xml/dlo.xml')
+    radius, along = dlo.physical()['self_collision'], np.linspace(0, dlo.chain.length, 101)
+    angle, nothing = along / COIL, 0 * along
+    chains = {'on the table': np.stack([along, nothing, nothing + radius], axis=1),
+              'hangs from a hand': np.stack([nothing, nothing, dlo.chain.length + 0.2 - along], axis=1),
+              'coiled on the table': np.stack([COIL * np.cos(angle), COIL * np.sin(angle), radius * (
+                  2 + PITCH * angle / np.pi)], axis=1)}
+    for nodes, where in product((21, 41), chains):
+        held = Grip(0, np.array([0.0, FALL]), np.repeat(chains[where][:1], 2, axis=0))
+        row = []
+        for form in ('extensible', 'inextensible'):
+            text = export_mjcf(dlo, Chain(chains[where]), form=form, options=Options(nodes=nodes))
+            model, state = started(with_hands(text, [held] * ('hand' in where)))
+            state.eq_active[:] = 1
+            second = round(1 / model.opt.timestep)
+            mujoco.mj_step(model, state, second)
+            begun = time.process_time()
+            mujoco.mj_step(model, state, second)
+            assert not state.warning.number.any(), f'{where}: MuJoCo warns that it is unstable'
+            row.append(f'{1 / (time.process_time() - begun):.2g}')
+        yield [str(nodes), where, str(state.ncon), *row]
+
+
+def with_hands(text: str, held: list[Grip], solref: str = SOLREFS[-1]) -> str:
     """Return a file with a hand for each grip, all open."""
     root = etree.fromstring(text.encode())
     equality = etree.SubElement(root, 'equality')
     for k, grip in enumerate(held):
-        body = etree.SubElement(root.find('worldbody'), 'body', name=f'hand_{k}', mocap='true')
+        body = etree.SubElement(root.find('worldbody'), 'body', name=f'hand_{k}', mocap='true',
+                                pos=' '.join(map(str, grip.positions[0])))
         etree.SubElement(body, 'site', name=f'hand_{k}')
         etree.SubElement(equality, 'connect', name=f'hand_{k}', site1=f'hand_{k}',
-                         site2=f'dlo_point_{grip.point}', active='false', solref='0.004 1')
+                         site2=f'dlo_point_{grip.point}', active='false', solref=solref)
     return etree.tostring(root, encoding='unicode')
 
 
-def replayed(found: Any, trial: Trial, options: Options) -> tuple[Floats, float]:
+def replayed(result: Any, trial: Trial, options: Options) -> tuple[Floats, float]:
     """Return the simulated points at the goal of a trial, (n, 3) [m], and the processor time of a second."""
     goal = trial.goals[0]
     held, offsets = grips(trial, goal.time + LONGEST), dict[int, Floats]()
-    model, state = started(with_hands(export_mjcf(found, trial.initial, options=options), held))
-    step, kept, since, begun = model.opt.timestep, points_of(model, state), 0.0, time.process_time()
+    model, state = started(with_hands(export_mjcf(result, trial.initial, options=options), held))
+    step, earlier, since, begun = model.opt.timestep, points_of(model, state), 0.0, time.process_time()
     while True:
         for k, grip in enumerate(held):
             constraint = model.equality(f'hand_{k}').id
@@ -227,10 +274,10 @@ def replayed(found: Any, trial: Trial, options: Options) -> tuple[Floats, float]
         assert not state.warning.number.any(), f'{trial.name}: MuJoCo warns that it is unstable'
         if state.time > goal.time and state.time - since >= Settling.time:
             now = points_of(model, state)
-            if np.linalg.norm(now - kept, axis=1).max() < Settling.distance or \
+            if np.linalg.norm(now - earlier, axis=1).max() < Settling.distance or \
                     state.time > goal.time + LONGEST:
                 return now, (time.process_time() - begun) / state.time
-            kept, since = now, state.time
+            earlier, since = now, state.time
 
 
 def trials_of(name: str, folder: Path, other: bool) -> Iterator[tuple[str, Trial]]:
@@ -239,9 +286,7 @@ def trials_of(name: str, folder: Path, other: bool) -> Iterator[tuple[str, Trial
         yield 'fitted', trial
     if not other:
         return
-    subprocess.run([sys.executable, str(figures.HERE / 'convert.py'), 'reference', name, str(folder / name),
-                    '--actions', 'other'], check=True, stdout=subprocess.DEVNULL)
-    for trial in read_session(folder / name).trials:
+    for trial in read_session(convert('reference', name, folder / name, '--actions', 'other')).trials:
         yield 'other', trial
 
 
@@ -249,15 +294,15 @@ def replays(folder: Path, other: bool) -> Iterator[list[str]]:
     """Yield a row for each sample and kind of trial: mean distances, MuJoCo's and ours."""
     for name in OBJECTS:
         session = read_session(figures.SAMPLES / name)
-        found = calibrate(session.trials, replace(session.options, engine='compiled'))
+        result = calibrate(session.trials, replace(session.options, engine='compiled'))
         engine, rows = CompiledSimulator(), dict[str, list[tuple[float, ...]]]()
         for kind, trial in trials_of(name, folder, other):
             measured = trial.goals[0].chain.points
-            ours = engine.simulate(trial, found.physical()).chains[0]
-            theirs, share = replayed(found, trial, session.options)
+            ours = engine.simulate(trial, result.physical()).chains[0]
+            theirs, share = replayed(result, trial, session.options)
             row = distance(theirs, measured), distance(ours, measured), distance(theirs, ours), share
             rows.setdefault(kind, []).append(row)
-            print(name, kind, trial.name, *(f'{one:.2f}' for one in row), flush=True)
+            print(name, kind, trial.name, *(f'{figure:.2f}' for figure in row), flush=True)
         for kind, all_of_kind in rows.items():
             table = np.array(all_of_kind)
             to_measured, ours_to, between, share = table.mean(axis=0)
@@ -270,8 +315,8 @@ def minutes() -> Iterator[list[str]]:
     """Yield a row for each sample: how far its points move in a minute."""
     for name in OBJECTS:
         session = read_session(figures.SAMPLES / name)
-        found = calibrate(session.trials, replace(session.options, engine='compiled'))
-        model, state = started(export_mjcf(found, session.trials[0].initial, options=session.options))
+        result = calibrate(session.trials, replace(session.options, engine='compiled'))
+        model, state = started(export_mjcf(result, session.trials[0].initial, options=session.options))
         second = round(1 / model.opt.timestep)
         mujoco.mj_step(model, state, second)
         before = points_of(model, state)
@@ -293,7 +338,8 @@ def main() -> None:
     for part in chosen.parts or [name for name in PARTS if name != 'minute']:
         other = ' --other' if part == 'trials' and chosen.other else ''
         with tempfile.TemporaryDirectory() as folder:
-            rows = {'cantilever': cantilevers, 'hanging': stretches, 'flexcomp': flexcomps, 'minute': minutes,
+            rows = {'cantilever': cantilevers, 'hanging': stretches, 'flexcomp': flexcomps, 'pin': pins,
+                    'speed': speeds, 'minute': minutes,
                     'trials': partial(replays, Path(folder), chosen.other)}[part]()
             text = figures.table(PARTS[part][1], rows)
         name = f'export_mujoco_{mujoco.__version__.split(".")[0]}_{part}'

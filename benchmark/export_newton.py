@@ -52,11 +52,12 @@ EXAMPLES = Setting(1 / 600, 5)  # those of newton/examples/cable
 RECIPE = Setting(1 / 2000, 30)
 MUCH = Setting(1 / 2000, 100)
 #: EI [N m^2], segments, EA [N], internal damping [s] and setting, of cantilevers.
-TRIED = (*((2e-2, 20, 300.0, 1e-3, one) for one in (
+TRIED = (*((2e-2, 20, 300.0, 1e-3, setting) for setting in (
     EXAMPLES, Setting(1 / 600, 100), Setting(1 / 2000, 10), RECIPE, Setting(1 / 6000, 10))),
          (2e-2, 20, 3000.0, 1e-3, RECIPE), (2e-2, 20, 300.0, 1e-2, RECIPE),
-         *((one, 20, 300.0, 1e-3, RECIPE) for one in (1e-3, 1e-5)),
-         *((one, 40, 300.0, 1e-3, RECIPE) for one in (2e-2, 1e-3, 1e-5)), (2e-2, 40, 300.0, 1e-3, MUCH))
+         *((stiffness, 20, 300.0, 1e-3, RECIPE) for stiffness in (1e-3, 1e-5)),
+         *((stiffness, 40, 300.0, 1e-3, RECIPE) for stiffness in (2e-2, 1e-3, 1e-5)),
+         (2e-2, 40, 300.0, 1e-3, MUCH))
 
 
 @warp.kernel
@@ -147,7 +148,7 @@ class World:
             self.time += 2 * self._step
 
     def _move_hands(self) -> None:
-        targets, speeds, gains = (one.numpy() for one in (self._targets, self._speeds, self._gains))
+        targets, speeds, gains = (array.numpy() for array in (self._targets, self._speeds, self._gains))
         mass = float(self._rope.masses[0])
         for k, grip in enumerate(self._grips):
             targets[k], after = ([np.interp(self.time + later, grip.times, axis) for axis in grip.positions.T]
@@ -158,26 +159,26 @@ class World:
 
     def points(self, places: Floats) -> Floats:
         """Return points of the DLO, (n, 3) [m], at arc lengths [m]."""
-        poses, found = self._states[0].body_q.numpy().astype(float), []
+        poses, points = self._states[0].body_q.numpy().astype(float), []
         for body, along in map(self._rope.place_of, places.tolist()):
             x, y, z, w = poses[body, 3:]
             axis = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
-            found.append(poses[body, :3] + (along - self._half[body]) * axis)
-        return np.array(found)
+            points.append(poses[body, :3] + (along - self._half[body]) * axis)
+        return np.array(points)
 
 
 def made_up(stiffness: float, stretching: float, damping: float) -> MadeUp:
     """Return a DLO with given EI [N m^2], EA [N] and internal damping [s]."""
     fixed = {name: BY_NAME[name].value(value) for name, value in (
         ('flexibility', stiffness), ('elasticity', stretching), ('internal_damping', damping))}
-    return MadeUp(ParameterSpace(tuple(one for one in PAPER_PARAMETERS if one not in fixed), fixed, MASS))
+    return MadeUp(ParameterSpace(tuple(name for name in PAPER_PARAMETERS if name not in fixed), fixed, MASS))
 
 
-def at_rest(found: Any, direction: tuple[float, float, float], segments: int, setting: Setting) -> Floats:
+def at_rest(dlo: Any, direction: tuple[float, float, float], segments: int, setting: Setting) -> Floats:
     """Return both ends of a DLO that was held at its first segment and let fall, (2, 3) [m]."""
     chain = Chain(np.linspace(0, LENGTH, 61)[:, None] * direction)
     options = Options(table=False, nodes=segments + 1)
-    world = World(export_usd(found, chain, options=options), ExportedRope.of(found, chain, options), setting,
+    world = World(export_usd(dlo, chain, options=options), ExportedRope.of(dlo, chain, options), setting,
                   DRAG, clamped=True)
     world.simulate(FALL)
     return world.points(np.array([0.0, LENGTH]))
@@ -214,11 +215,11 @@ def stretches() -> str:
     return table(['EA, N', 'Newton, mm', 'EA and weight, mm'], rows)
 
 
-def replay(found: Any, trial: Trial, grips: list[Grip], end: float) -> Floats:
+def replay(dlo: Any, trial: Trial, grips: list[Grip], end: float) -> Floats:
     """Return the points of a trial, (n, 3) [m]."""
     options = Options(nodes=NODES)
-    rope = ExportedRope.of(found, trial.initial, options)
-    text = export_usd(found, trial.initial, options=options)
+    rope = ExportedRope.of(dlo, trial.initial, options)
+    text = export_usd(dlo, trial.initial, options=options)
     world = World(text, rope, RECIPE, rope.drag, grips=grips)
     world.simulate(end)
     return world.points(rope.point_places)

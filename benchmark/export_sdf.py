@@ -71,7 +71,7 @@ class Gazebo:
         world.write_text(f'<?xml version="1.0"?><sdf version="1.9"><world name="around"><gravity>0 0 -9.81'
                          f'</gravity>{in_world}{inside}{in_model}</model></world></sdf>')
         done = subprocess.run([str(self._program), str(world), f'{seconds}', f'{seconds}', f'{drag}',
-                               *(f'{one:.9g}' for one in hold)], input=hands, text=True, check=True,
+                               *(f'{value:.9g}' for value in hold)], input=hands, text=True, check=True,
                               stdout=subprocess.PIPE)
         rows = np.array(done.stdout.splitlines()[-1].split()[1:], dtype=float).reshape(-1, 7)
         return [Pose(row[:3], row[[4, 5, 6, 3]]) for row in rows]
@@ -86,18 +86,19 @@ class Gazebo:
         last = self.simulate(text, '', CLAMP, 12.0, DRAG)[-1]
         return last.points(np.array([LENGTH / segments, 0, 0]))
 
-    def replay(self, found: Any, trial: Trial, grips: list[Grip], end: float) -> Floats:
+    def replay(self, dlo: Any, trial: Trial, grips: list[Grip], end: float) -> Floats:
         """Return the points of a trial, (n, 3) [m]."""
         options = Options(nodes=NODES)
-        rope = ExportedRope.of(found, trial.initial, options)
-        text = export_sdf(found, trial.initial, options=options)
+        rope = ExportedRope.of(dlo, trial.initial, options)
+        text = export_sdf(dlo, trial.initial, options=options)
         assert rope.table is not None
         table = TABLE.format(height=rope.table - 0.1)
         rows = []
         for grip in grips:
             segment, along = rope.place_of(float(rope.point_places[grip.point]))
             knots = np.column_stack([grip.times, grip.positions]).ravel()
-            rows.append(f'{segment} {along:.9g} {len(grip.times)} ' + ' '.join(f'{one:.9g}' for one in knots))
+            numbers = ' '.join(f'{value:.9g}' for value in knots)
+            rows.append(f'{segment} {along:.9g} {len(grip.times)} {numbers}')
         mass = float(rope.masses[0])
         poses = self.simulate(text, table, '', end, rope.drag, '\n'.join(rows), (
             HOLD[0] * mass / STEP**2, HOLD[1] * mass / STEP))

@@ -34,7 +34,7 @@ def side_by_side(benchmark: Any, calls: Mapping[str, Callable[[], object]], roun
 
     *others, last = calls
     benchmark.pedantic(take, (last,), setup=lambda: [take(name) for name in others] and None, rounds=rounds)
-    shortest = {name: min(found) for name, found in times.items()}
+    shortest = {name: min(durations) for name, durations in times.items()}
     benchmark.extra_info.update({f'{name} [s]': seconds for name, seconds in shortest.items()})
     return shortest
 
@@ -65,7 +65,7 @@ def write(name: str, command: str, how: str, text: str) -> None:
     readme = HERE / 'README.md'
     before = readme.read_text(encoding='utf-8')
     after, count = re.subn(rf'(<!-- {name} begins -->\n).*?(<!-- {name} ends -->)',
-                           lambda found: f'{found[1]}\n{text}\n\n{found[2]}', before, flags=re.DOTALL)
+                           lambda match: f'{match[1]}\n{text}\n\n{match[2]}', before, flags=re.DOTALL)
     assert count == 1, f'README.md has {count} places for {name}'
     readme.write_text(after, encoding='utf-8')
     print(f'\n{text}')

@@ -2,17 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Play the first day with a robot and a tracker, and print what the user was told, and when.
+Play the first day with a robot and a tracker, and print each message to the user with its time.
 
     python benchmark/first_day.py [--minutes 10] [--output DIR]
 
-The node is a process of its own whose caches and folders are new, so that it has nothing compiled.  A
-tracker sends 30 clouds a second from the beginning to the end: first in a frame 0.75 m above the table, then
-the same with the parameter `frame_pose`.  A hand moves a simulated rope three times, the node calibrates
-twice: after the third trial, and again when the tracker has shown the rope at rest for minutes.  Another
-thread calls a service of the node ten times a second, and measures how long each answer takes.  At last the
-recorded session is calibrated again, with the command line.  The table is written to
-benchmark/results/first_day.md.
+The node is a process of its own with new folders.  A tracker sends 30 clouds a second from the beginning to
+the end: first in a frame 0.75 m above the table, then the same with the parameter `frame_pose`.  A hand
+moves a simulated rope three times, the node calibrates twice: after the third trial, and again when the
+tracker has shown the rope at rest for minutes.  Another thread calls a service of the node ten times a
+second, and measures how long each answer takes.  At last the recorded session is calibrated again, with the
+command line.  The table is written to benchmark/results/first_day.md.
 """
 
 from __future__ import annotations
@@ -72,7 +71,7 @@ def cloud(points, stamp):
 
 
 class Rope:
-    """A simulated rope on a table, and where it is at each instant of the day."""
+    """A simulated rope on a table, and its points at each instant of the day."""
 
     def __init__(self) -> None:
         along = np.linspace(-0.5, 0.5, NODES)
@@ -114,12 +113,12 @@ class Rope:
 
 
 class Day:
-    """Tracker, hand and user: what they send, and what they are told."""
+    """Tracker, hand and user: their messages, and those that they receive."""
 
     def __init__(self, minutes: float) -> None:
         self.rope, self.minutes = Rope(), minutes
         self.generator = np.random.default_rng(0)
-        self.told: list[tuple[float, str, str]] = []
+        self.events: list[tuple[float, str, str]] = []
         self.waits: list[tuple[float, float]] = []  # s for an answer, and when it came
         self.heard, self.over = {}, False
         self.node = rclpy.create_node('day')
@@ -146,22 +145,22 @@ class Day:
         """Seconds since the day began."""
         return time.monotonic() - self.begun
 
-    def tell(self, who: str, text: str) -> None:
-        """Note what the user was told, or did."""
-        if not self.told or self.told[-1][1:] != (who, text):
-            self.told.append((self.now, who, text))
+    def report(self, who: str, text: str) -> None:
+        """Print and record an event: a message to the user, or an act."""
+        if not self.events or self.events[-1][1:] != (who, text):
+            self.events.append((self.now, who, text))
             print(f'{self.now:7.1f} s  {who:8} {text}', flush=True)
 
     def hear(self, name: str, message: DiagnosticArray) -> None:
-        """Note a status or result."""
+        """Record a status or result."""
         self.heard[name] = message
-        for one in message.status if name == 'result' else message.status[:1]:
-            self.tell(name, f'{one.name}: {one.message}' if name == 'result' else one.message)
+        for status in message.status if name == 'result' else message.status[:1]:
+            self.report(name, f'{status.name}: {status.message}' if name == 'result' else status.message)
 
     def hear_log(self, message: Log) -> None:
-        """Note a line of the node's log."""
+        """Record a line of the node's log."""
         if message.name.endswith('calibrator'):
-            self.tell('log', message.msg)
+            self.report('log', message.msg)
 
     def track(self) -> None:
         """Publish what the tracker sees now, in its own frame."""
@@ -175,7 +174,7 @@ class Day:
         return cloud(seen, stamp)
 
     def probe(self) -> None:
-        """Call a service again and again; keep how long each answer took."""
+        """Call a service again and again; record the duration of each answer."""
         while not self.get.wait_for_service(0.1):
             pass
         while not self.over:
@@ -194,11 +193,11 @@ class Day:
         return future.result()
 
     def ask(self, name: str) -> float:
-        """Call a request of the node; return when it was sent."""
+        """Call a request of the node; return the time at which it was sent [s]."""
         sent = self.now
         answer = self.call(self.clients[name], Trigger.Request())
         self.waits.append((self.now - sent, self.now))
-        self.tell('~/' + name, f'answered after {self.now - sent:.2f} s: {answer.message}')
+        self.report('~/' + name, f'answered after {self.now - sent:.2f} s: {answer.message}')
         return sent
 
     def move(self, number: int) -> None:
@@ -208,7 +207,7 @@ class Day:
         begin = (stamp - self.dawn).nanoseconds / 1e9
         times, way = self.rope.act(number, begin)
         self.hands.publish(action([(times, way + (0.0, 0.0, LIFTED))], stamp))
-        self.tell('robot', f'action {number + 1}')
+        self.report('robot', f'action {number + 1}')
         self.wait(begin + times[-1] + SWING)
 
     def wait(self, until: float) -> None:
@@ -216,7 +215,7 @@ class Day:
         time.sleep(max(0.0, until - self.now))
 
     def result(self, since: float, patience: float = 600.0) -> float:
-        """Wait for the result of a calibration that was asked for at a time [s]; return how long it took."""
+        """Wait for the result of a calibration that was requested at a time [s]; return its duration [s]."""
         self.heard.pop('result', None)
         while 'result' not in self.heard:
             if self.now - since > patience:
@@ -226,19 +225,19 @@ class Day:
 
     def play(self) -> dict[str, float]:
         """Play the day; return figures."""
-        while not all(one.service_is_ready() for one in (*self.clients.values(), self.set)):
+        while not all(client.service_is_ready() for client in (*self.clients.values(), self.set)):
             time.sleep(0.01)
         figures = {'services ready after': self.now}
-        self.tell('user', "the node is there; the hand acts, in a frame that is not the table's")
+        self.report('user', "the node is there; the hand acts, in a frame that is not the table's")
         self.move(0)
         self.wait(self.now + 4.0)
-        figures['told about the frame'] = float(any(
-            'frame_pose' in text for _, who, text in self.told if who in ('status', 'log')))
+        figures['warned about the frame'] = float(any(
+            'frame_pose' in text for _, who, text in self.events if who in ('status', 'log')))
         self.ask('reset')
         pose = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=f'0 0 {-LIFTED} 0 0 0 1')
         answer = self.call(self.set, SetParameters.Request(
             parameters=[Parameter(name='frame_pose', value=pose)])).results[0]
-        self.tell('user', f'sets frame_pose to {pose.string_value}: '
+        self.report('user', f'sets frame_pose to {pose.string_value}: '
                   f'{"done" if answer.successful else answer.reason}')
         for number in (1, 2, 3):
             self.move(number)
@@ -266,7 +265,7 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     os.environ |= {'ROS_DOMAIN_ID': str(1 + os.getpid() % 100), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
                    'ROS_LOG_DIR': str(folder / 'log')}
-    sys.setswitchinterval(0.0005)  # as the node: these threads shall not be what is waited for
+    sys.setswitchinterval(0.0005)  # as the node, so that no answer waits for these threads
     rclpy.init()
     day = Day(chosen.minutes)
     child = subprocess.Popen([sys.executable, '-m', 'dlo_calibration.ros.executable', 'calibrator',
@@ -291,20 +290,21 @@ def print_day(day: Day, figures: dict[str, float], folder: Path) -> None:
     done = subprocess.run([sys.executable, '-m', 'dlo_calibration', 'fit', str(session), '--json'],
                           check=True, stdout=subprocess.PIPE)
     replayed = json.loads(done.stdout)
-    result = {one.name: values(day.heard['result'], one.name) for one in day.heard['result'].status}
+    result = {status.name: values(day.heard['result'], status.name) for status in day.heard['result'].status}
     rows = ['| parameter | truth | found by the node | 90 % interval | replayed |', '|---|---|---|---|---|']
     for name, truth in TRUTH.items():
-        one, again = result[name], replayed['parameters'][name]
-        rows.append(f'| {name} | {truth:.1f} | {float(one["value"]):.4f} '
-                    f'| {float(one["lower"]):.1f} to {float(one["upper"]):.1f} | {again["value"]:.4f} |')
+        estimate, again = result[name], replayed['parameters'][name]
+        value, lower, upper = (float(estimate[key]) for key in ('value', 'lower', 'upper'))
+        rows.append(f'| {name} | {truth:.1f} | {value:.4f} | {lower:.1f} to {upper:.1f} '
+                    f'| {again["value"]:.4f} |')
     lines = [f'| {name} | {value:.4g} |' for name, value in figures.items()]
-    told = [f'{when:7.1f} s  {who:8} {text}' for when, who, text in day.told]
+    events = [f'{when:7.1f} s  {who:8} {text}' for when, who, text in day.events]
     text = '\n'.join([
         '# first day', '',
         f'`python benchmark/first_day.py --minutes {day.minutes:g}`; times in seconds.', '',
         '| figure | value |', '|---|---|', *lines, '', *rows, '',
         f'Mean error of the replay {1e3 * replayed["mean_error_m"]:.2f} mm.', '',
-        'What the user was told:', '', '```', *told, '```', ''])
+        'What the user read:', '', '```', *events, '```', ''])
     (HERE / 'results' / 'first_day.md').write_text(text)
     print('\n'.join([*lines, '', *rows]))
 

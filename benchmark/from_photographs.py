@@ -100,7 +100,7 @@ def scene(generator: np.random.Generator, radius: float, low: np.ndarray, high: 
             'turn': generator.uniform(-np.pi, np.pi)}
 
 
-def taken(generator: np.random.Generator, shared: dict[str, Any], chain: Chain, radius: float,
+def photograph_of(generator: np.random.Generator, shared: dict[str, Any], chain: Chain, radius: float,
           low: np.ndarray, high: np.ndarray) -> tuple[bytes, np.ndarray]:
     """Return a photograph of a chain as a file, and what a person clicks on."""
     board: LaidBoard = shared['board']
@@ -163,7 +163,8 @@ def judge(dlo: Manipulated, seed: int) -> dict[float, dict[str, Any]]:
         shared = scene(generator, dlo.radius, low, high)
         boards.append(shared['board'])
         for name, chain in (('start', trial.initial), ('goal', trial.goals[0].chain)):
-            photographs[f'{trial.name} {name}'] = taken(generator, shared, chain, dlo.radius, low, high)
+            photographs[f'{trial.name} {name}'] = photograph_of(
+                generator, shared, chain, dlo.radius, low, high)
             exact[f'{trial.name} {name}'] = shared['board'].seen_from(chain.points)
     errors = generator.standard_normal((len(dlo.trials), 2))
     return {marked: calibrated(dlo, seed, photographs, exact, [
@@ -183,17 +184,18 @@ def calibrated(dlo: Manipulated, seed: int, photographs: dict[str, tuple[bytes, 
     begun = os.times().user
     with tempfile.TemporaryDirectory() as folder:
         read, ids = drafted(Path(folder) / 'project', photographs, said, {'mass': dlo.mass})
-    unusable = [str(one.plain['remarks']) for one in read.trials if one.trial is None]
-    unusable += [f'{name}: {read.photographs[one].plain["trace_problem"]}' for name, one in ids.items()
-                 if read.photographs[one].axis is None]
+    unusable = [str(trial.plain['warnings']) for trial in read.trials if trial.trial is None]
+    shown = {name: read.photographs[photograph_id] for name, photograph_id in ids.items()}
+    unusable += [f'{name}: {photo.plain["trace_problem"]}' for name, photo in shown.items()
+                 if photo.axis is None]
     if unusable:
         return {'problem': '; '.join(unusable)}
     trials = tuple(timed(trial, true) for trial, true in zip(read.complete, dlo.trials, strict=True))
     seen, true = ([chain for trial in some for chain in (trial.initial, trial.goals[0].chain)]
                   for some in (trials, dlo.trials))
-    off = [np.linalg.norm(one.points - points, axis=1)
-           for one, points in zip(seen, exact.values(), strict=True)]
-    lengths = [one.length / other.length - 1 for one, other in zip(seen, true, strict=True)]
+    off = [np.linalg.norm(chain.points - points, axis=1)
+           for chain, points in zip(seen, exact.values(), strict=True)]
+    lengths = [chain.length / other.length - 1 for chain, other in zip(seen, true, strict=True)]
     reading = os.times().user - begun
     options = Options.of({**read.options, 'engine': 'compiled', 'workers': 1, 'seed': seed})
     result = calibrate(trials, options, make_simulator=make_simulator)
@@ -202,22 +204,23 @@ def calibrated(dlo: Manipulated, seed: int, photographs: dict[str, tuple[bytes, 
             'whole': os.times().user - begun, 'fit': 1e3 * result.errors.mean}
 
 
-def row(dlo: Manipulated, seed: int, one: dict[str, Any], inside: list[bool]) -> tuple[object, ...]:
+def row(dlo: Manipulated, seed: int, figures: dict[str, Any], inside: list[bool]) -> tuple[object, ...]:
     """Return the row of one calibration, and add to `inside` whether intervals contain the truth."""
-    if 'problem' in one:
+    if 'problem' in figures:
         inside.append(False)
-        return (dlo.name, seed, one['problem'], *[''] * 7)
+        return (dlo.name, seed, figures['problem'], *[''] * 7)
     cells = []
     for name in TRUTH:
-        found, true = one['parameters'][name], dlo.truth[name]
-        holds = found.lower <= true <= found.upper
-        text = f'{found.value:.1f} [{found.lower:.1f}, {found.upper:.1f}] ({true:.1f})'
-        told = found.verdict == 'identifiable'
-        cells.append((text if holds else f'**{text}**') + ('' if told else f' {found.verdict}'))
-        inside += [holds] * told
-    return (dlo.name, seed, *cells, f'{one["mean"]:.2f}, {one["worst"]:.2f}', f'{one["length"]:+.2f}',
-            f'{one["diameter"]:.1f} ({2e3 * dlo.radius:.1f})', f'{one["fit"]:.2f}',
-            f'{one["reading"]:.1f}, {one["whole"]:.1f}')
+        estimate, true = figures['parameters'][name], dlo.truth[name]
+        holds = estimate.lower <= true <= estimate.upper
+        text = f'{estimate.value:.1f} [{estimate.lower:.1f}, {estimate.upper:.1f}] ({true:.1f})'
+        identifiable = estimate.verdict == 'identifiable'
+        cells.append((text if holds else f'**{text}**') + ('' if identifiable else f' {estimate.verdict}'))
+        inside += [holds] * identifiable
+    return (dlo.name, seed, *cells, f'{figures["mean"]:.2f}, {figures["worst"]:.2f}',
+            f'{figures["length"]:+.2f}', f'{figures["diameter"]:.1f} ({2e3 * dlo.radius:.1f})',
+            f'{figures["fit"]:.2f}',
+            f'{figures["reading"]:.1f}, {figures["whole"]:.1f}')
 
 
 def main() -> None:
@@ -233,9 +236,10 @@ def main() -> None:
     cases = [(dlo, seed) for dlo in manipulated() if options.only in ('', dlo.name)
              for seed in range(options.seed, options.seed + options.draws)]
     with ProcessPoolExecutor(options.workers, multiprocessing.get_context('spawn')) as executor:
-        for (dlo, seed), found in zip(cases, executor.map(judge, *zip(*cases, strict=True)), strict=True):
-            for marked, one in found.items():
-                rows[marked].append(row(dlo, seed, one, inside[marked]))
+        judged = executor.map(judge, *zip(*cases, strict=True))
+        for (dlo, seed), calibrations in zip(cases, judged, strict=True):
+            for marked, figures in calibrations.items():
+                rows[marked].append(row(dlo, seed, figures, inside[marked]))
                 print(marked, rows[marked][-1], flush=True)
     columns = ('DLO', 'seed', *(f'{name}: found [interval] (truth)' for name in TRUTH),
                'chains, mean and worst point, mm', 'length, %', 'diameter (truth), mm', 'fitted, mm',

@@ -83,14 +83,14 @@ def draw(name: str, search: str, seed: int) -> Draw:
     begun = time.perf_counter()
     result = fitted(Setting(tuple(calibrated), options, CompiledSimulator()))
     seconds = time.perf_counter() - begun
-    truth = np.array([BY_NAME[one].value(properties[TRUTH[one]]) for one in PAPER_PARAMETERS])
-    found = [result.parameters[one] for one in PAPER_PARAMETERS]
+    truth = np.array([BY_NAME[name].value(properties[TRUTH[name]]) for name in PAPER_PARAMETERS])
+    estimates = [result.parameters[name] for name in PAPER_PARAMETERS]
     unseen = Evaluator(other, result.space, CompiledSimulator()).evaluate(0, result.best.point).errors
     assert unseen is not None and result.examination is not None
     return Draw(
-        np.array([one.value for one in found]), np.array([one.std for one in found]),
-        np.array([one.lower <= at <= one.upper for one, at in zip(found, truth, strict=True)]),
-        tuple(one.verdict for one in found), len(result.evaluations), result.errors.mean, unseen.mean,
+        np.array([each.value for each in estimates]), np.array([each.std for each in estimates]),
+        np.array([each.lower <= at <= each.upper for each, at in zip(estimates, truth, strict=True)]),
+        tuple(each.verdict for each in estimates), len(result.evaluations), result.errors.mean, unseen.mean,
         result.examination.cross_validated, seconds)
 
 
@@ -116,22 +116,22 @@ def main() -> None:
             draws = list(executor.map(partial(draw, name, options.search), range(options.draws)))
             properties, _ = exact_trials(name)
             for j, parameter in enumerate(PAPER_PARAMETERS):
-                values = np.array([one.values[j] for one in draws])
-                told = np.array([one.verdicts[j] == 'identifiable' for one in draws])
-                covered = np.array([one.inside[j] for one in draws])
+                values = np.array([each.values[j] for each in draws])
+                identifiable = np.array([each.verdicts[j] == 'identifiable' for each in draws])
+                covered = np.array([each.inside[j] for each in draws])
                 truth = BY_NAME[parameter].value(properties[TRUTH[parameter]])
                 rows.append(
                     f'| {k} | {parameter} | {truth:.1f} | {values.mean():.1f} | {values.std():.2f} '
-                    f'| {np.median([one.std[j] for one in draws]):.2f} | {100 * covered.mean():.0f} % '
-                    f'| {100 * told.mean():.0f} % |')
+                    f'| {np.median([each.std[j] for each in draws]):.2f} | {100 * covered.mean():.0f} % '
+                    f'| {100 * identifiable.mean():.0f} % |')
                 if parameter != 'self_collision':
                     inside.append(covered.mean())
             fits.append(
-                f'| {k} | {np.median([one.evaluations for one in draws]):.0f} '
-                f'| {1e3 * np.mean([one.error for one in draws]):.2f} '
-                f'| {1e3 * np.mean([one.unseen for one in draws]):.2f} '
-                f'| {1e3 * np.mean([one.cross_validated for one in draws]):.2f} '
-                f'| {np.median([one.seconds for one in draws]):.1f} |')
+                f'| {k} | {np.median([each.evaluations for each in draws]):.0f} '
+                f'| {1e3 * np.mean([each.error for each in draws]):.2f} '
+                f'| {1e3 * np.mean([each.unseen for each in draws]):.2f} '
+                f'| {1e3 * np.mean([each.cross_validated for each in draws]):.2f} '
+                f'| {np.median([each.seconds for each in draws]):.1f} |')
             print(*rows[-4:], fits[-1], sep='\n', flush=True)
     text = (
         f'# {title}\n\n`python benchmark/intervals.py --draws {options.draws}{chosen}`: {options.draws} '

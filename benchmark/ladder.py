@@ -8,7 +8,7 @@ Measure the rungs: what fewer nodes and longer steps cost and save in searches.
 
 Searches are those of the sessions, by default of the five samples.  Each is made with the default nodes and
 steps, and on each rung.  The result of a rung then climbs: least squares goes on with the default ones from
-there, with the Jacobian that it has; of the points of another search, the tenth with the lowest scores is
+there, with the Jacobian that it has; the tenth of the points of another search with the lowest scores is
 evaluated again.  The random search tries the same points on all rungs, so that their scores are compared,
 too.  All is simulated in one process.  The table is printed, and that of the samples written to
 benchmark/results/ladder.md.
@@ -18,17 +18,19 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
 import time
 from typing import Callable, NamedTuple, Sequence
 
+from figures import table
 import numpy as np
 
 from dlo_calibration import Options
 from dlo_calibration.calibration.calibrate import fitted
 from dlo_calibration.calibration.engines import make_simulator
 from dlo_calibration.calibration.fit import Fit, fit
-from dlo_calibration.calibration.prior import prior
+from dlo_calibration.calibration.prior import Prior
 from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.files.session import read_session, samples, session_trials
 from dlo_calibration.model.chain import Floats
@@ -39,7 +41,7 @@ from dlo_calibration.search.sampling import RandomSearch
 RESULTS = Path(__file__).resolve().parent / 'results'
 RUNGS = ((31, 0.004), (21, 0.006), (15, 0.009))  # nodes, time step [s]
 BUDGET = 150  # evaluations
-KNOWN = 0.5  # of the range; parameters with wider intervals are left out
+NARROW = 0.5  # of the range; parameters with wider intervals are left out
 
 
 class Measured(NamedTuple):
@@ -51,10 +53,10 @@ class Measured(NamedTuple):
 
 
 def timed(call: Callable[[], Fit]) -> tuple[Measured, Fit]:
-    """Return what a search of this process took and found."""
+    """Return the measures and the fit of a search in this process."""
     begun = time.process_time()
-    found = call()
-    return Measured(time.process_time() - begun, len(found.evaluations), found.best.point), found
+    outcome = call()
+    return Measured(time.process_time() - begun, len(outcome.evaluations), outcome.best.point), outcome
 
 
 class Comparison:
@@ -63,17 +65,17 @@ class Comparison:
     def __init__(self, trials: Sequence[Trial], options: Options) -> None:
         self._trials, self._options = tuple(trials), options
         self._default = self._on(options)
-        known, found = prior(self._default.trials, self._default.options), fitted(self._default)
-        self._hints, self._space = known.hints, known.space
-        widths = [(found.parameters[name].upper - found.parameters[name].lower) / 100
+        prior, result = Prior.of(self._default.trials, self._default.options), fitted(self._default)
+        self._hints, self._space = prior.hints, prior.space
+        widths = [(result.parameters[name].upper - result.parameters[name].lower) / 100
                   for name in self._space.free]
-        self._intervals = np.where(np.array(widths) < KNOWN, widths, np.inf)
+        self._intervals = np.where(np.array(widths) < NARROW, widths, np.inf)
 
     def _on(self, options: Options) -> Setting:
         return Setting(self._trials, options, make_simulator(options))
 
-    def _away(self, one: Floats, other: Floats) -> float:
-        return float((np.abs(one - other) / self._intervals).max())
+    def _away(self, point: Floats, other: Floats) -> float:
+        return float((np.abs(point - other) / self._intervals).max())
 
     def rows(self, name: str) -> list[list[float]]:
         """
@@ -87,11 +89,11 @@ class Comparison:
         rows = [[usual.evaluations, usual.seconds, away, 0.0, 0, usual.seconds, away]]
         for nodes, step in RUNGS:
             setting = self._on(replace(self._options, nodes=nodes, time_step=step))
-            coarse, found = timed(lambda setting=setting: self._search(name, setting, 1))
-            climbed, _ = timed(lambda found=found: self._climb(found))
-            apart = scores_apart(fine, found) if name == RandomSearch.name else 0.0
-            rows.append([coarse.evaluations, coarse.seconds, self._away(coarse.point, usual.point), apart,
-                         climbed.evaluations, coarse.seconds + climbed.seconds,
+            measured, coarse = timed(lambda setting=setting: self._search(name, setting, 1))
+            climbed, _ = timed(lambda coarse=coarse: self._climb(coarse))
+            difference = score_difference(fine, coarse) if name == RandomSearch.name else 0.0
+            rows.append([measured.evaluations, measured.seconds, self._away(measured.point, usual.point),
+                         difference, climbed.evaluations, measured.seconds + climbed.seconds,
                          self._away(climbed.point, usual.point)])
         return rows
 
@@ -99,26 +101,22 @@ class Comparison:
         search = SEARCHES[name](self._space.dimension, seed, self._hints)
         return fit(setting, self._space, search, BUDGET)
 
-    def _climb(self, found: Fit) -> Fit:
-        """Return what is found with the default nodes and steps where a coarse search has ended."""
-        if found.search == LeastSquares.name:
-            hints = Hints.at(found.best.point, None if found.model is None else found.model.jacobian)
+    def _climb(self, coarse: Fit) -> Fit:
+        """Return the fit with the default nodes and steps that starts at the result of a coarse one."""
+        if coarse.search == LeastSquares.name:
+            hints = Hints.at(coarse.best.point, None if coarse.model is None else coarse.model.jacobian)
             search = LeastSquares(self._space.dimension, 1, hints)
             return fit(self._default, self._space, search, BUDGET)
-        ranked = sorted(found.evaluations, key=lambda one: one.score)[:len(found.evaluations) // 10]
-        again = list(self._default.evaluate(self._space)(np.array([one.point for one in ranked]), 0))
-        return replace(found, best=min(again, key=lambda one: one.score), evaluations=tuple(again))
+        ranked = sorted(coarse.evaluations, key=attrgetter('score'))[:len(coarse.evaluations) // 10]
+        points = np.array([evaluation.point for evaluation in ranked])
+        again = tuple(self._default.evaluate(self._space)(points, 0))
+        return replace(coarse, best=min(again, key=attrgetter('score')), evaluations=again)
 
 
-def scores_apart(one: Fit, other: Fit) -> float:
+def score_difference(usual: Fit, other: Fit) -> float:
     """Return the median difference [cm] of the scores of two searches that tried the same points."""
     return float(np.median([abs(first.score - second.score)
-                            for first, second in zip(one.evaluations, other.evaluations, strict=True)]))
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table in Markdown."""
-    return '\n'.join(f'| {" | ".join(row)} |' for row in (head, ['---'] * len(head), *rows))
+                            for first, second in zip(usual.evaluations, other.evaluations, strict=True)]))
 
 
 def name_of(rung: tuple[int, float] | None) -> str:
@@ -134,12 +132,12 @@ def searches(sessions: Sequence[Path]) -> str:
         compared.append(Comparison(session_trials(session, session.options)[0], session.options))
     rows = []
     for name in SEARCHES:
-        each = np.array([one.rows(name) for one in compared])  # (sessions, rungs, numbers)
+        each = np.array([comparison.rows(name) for comparison in compared])  # (sessions, rungs, numbers)
         for k, rung in enumerate((None, *RUNGS)):
-            evaluations, seconds, away, apart, again, both, after = each[:, k].T
+            evaluations, seconds, away, difference, again, both, after = each[:, k].T
             rows.append([name, name_of(rung), f'{evaluations.mean():.0f}', f'{seconds.sum():.1f}',
                          f'{away.mean():.2f} ({away.max():.2f})',
-                         f'{apart.mean():.1f} ({apart.max():.1f})' if apart.any() else '',
+                         f'{difference.mean():.1f} ({difference.max():.1f})' if difference.any() else '',
                          f'{again.mean():.0f}' if rung else '', f'{both.sum():.1f}' if rung else '',
                          f'{after.mean():.2f} ({after.max():.2f})' if rung else ''])
     return table(('search', 'rung', 'evaluations', 's', 'error', 'scores differ by, cm',

@@ -59,7 +59,7 @@ def subjects(folder: Path) -> Iterator[tuple[str, Sequence[Trial], Options]]:
 
 
 def promised(trials: Sequence[Trial], options: Options) -> TrialInformation:
-    """Return what the status tells after the last trial."""
+    """Return the information in the status after the last trial."""
     appraiser = LiveInformation(make_simulator)
     for count in range(1, len(trials) + 1):
         appraiser.start(trials[:count], options)
@@ -75,16 +75,16 @@ def main() -> None:
     ratios, agreed = defaultdict(list), []
     with tempfile.TemporaryDirectory() as folder:
         for name, trials, options in subjects(Path(folder)):
-            told = promised(trials, options)
+            promise = promised(trials, options)
             result = fitted(Setting(tuple(trials), options, make_simulator(options)))
-            for k, parameter in enumerate(told.names):
-                found = result.parameters[parameter]
-                std = float(told.after[k]) * SCALE
-                ratios[parameter].append(std / found.std)
-                agreed.append(told.verdicts[k] == found.verdict)
-                rows.append(f'| {name} | {len(trials)} | {parameter} | {std:.2f} | {found.std:.2f} '
-                            f'| {std / found.std:.2f} | {told.verdicts[k]} | {found.verdict} |')
-            print(*rows[-len(told.names):], sep='\n', flush=True)
+            for k, parameter in enumerate(promise.names):
+                estimate = result.parameters[parameter]
+                std = float(promise.after[k]) * SCALE
+                ratios[parameter].append(std / estimate.std)
+                agreed.append(promise.verdicts[k] == estimate.verdict)
+                rows.append(f'| {name} | {len(trials)} | {parameter} | {std:.2f} | {estimate.std:.2f} '
+                            f'| {std / estimate.std:.2f} | {promise.verdicts[k]} | {estimate.verdict} |')
+            print(*rows[-len(promise.names):], sep='\n', flush=True)
     summary = ['| parameter | subjects | promised / found, median | smallest | largest |', '|' + '---|' * 5]
     summary += [f'| {name} | {len(some)} | {np.median(some):.2f} | {min(some):.2f} | {max(some):.2f} |'
                 for name, some in ratios.items()]

@@ -115,7 +115,7 @@ def sticker(place: Floats) -> Sheet:
     return Sheet(side, (STICKER, STICKER), (place[0] - STICKER / 2, place[1] - STICKER / 2))
 
 
-def taken(number: int, points: Floats, opened: Sequence[Floats]) -> np.ndarray[Any, Any]:
+def photograph_of(number: int, points: Floats, opened: Sequence[Floats]) -> np.ndarray[Any, Any]:
     """
     Return one of the photographs, as pixels.
 
@@ -158,10 +158,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for number, name in enumerate(NAMES):
         exif = Image.Exif()
         exif.get_ifd(0x8769)[0xa405] = round(WIDE)  # FocalLengthIn35mmFilm
-        pixels = taken(number, lying[number], opened[:number])
+        pixels = photograph_of(number, lying[number], opened[:number])
         Image.fromarray(pixels).save(folder / f'{name}.jpg', quality=85, exif=exif)
     text = json.dumps(truth(lying, actions), indent=1)
-    text = re.sub(r'\[\s+([-\d.,\s]+?)\s+\]', lambda found: f'[{" ".join(found[1].split())}]', text)
+    text = re.sub(r'\[\s+([-\d.,\s]+?)\s+\]', lambda match: f'[{" ".join(match[1].split())}]', text)
     (folder / 'truth.json').write_text(f'{text}\n', encoding='utf-8')
     return 0
 

@@ -24,11 +24,11 @@ from reality import KnownDlo, Pair, random_pair, Reality, seen
 
 from dlo_calibration.calibration.calibrate import fitted
 from dlo_calibration.calibration.engines import SimulatorFactory
-from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.options import Options, recordable
 from dlo_calibration.calibration.result import ParameterEstimate
 from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.errors import DloCalibrationError
-from dlo_calibration.experiment.study import effective, Observed, task_digest
+from dlo_calibration.experiment.study import Observed, task_digest
 from dlo_calibration.model.action import Action
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.parameters import BY_NAME, PAPER_PARAMETERS, ParameterSpace
@@ -42,19 +42,19 @@ NOISE = 1e-3  # m, standard deviation of each coordinate that the camera sees
 REPLANNED_ACTIONS = 6  # at most, of a replanned execution
 FOCAL_POINT = 0  # of the difference score, whose features are both ends, as no hand holds the DLO
 OPEN_LOOP, REPLANNED = 'open_loop', 'replanned'
-#: Beside the package's own code, this decides what an execution leads to.
+#: With the package's own code, this determines the outcome of an execution.
 CODE = tuple(Path(__file__).with_name(name).read_bytes() for name in ('plan_executions.py', 'reality.py'))
 
 
 @dataclass(frozen=True)
 class Belief:
     """
-    The parameters that a planner believes a DLO to have: a `CalibratedDlo` of plain values.
+    The parameters of a DLO in the belief of a planner: a `CalibratedDlo` of plain values.
 
     :param kind: FITTED, DEFAULT or TRUE.
     :param mass: [kg]; `length` [m].
-    :param intervals: value of each parameter with the ends of its 90 % interval, on the 0..100 scale; the
-        ends equal a value that the planner is certain of.
+    :param intervals: value of each parameter with the ends of its 90 % interval, on the 0..100 scale; of a
+        certain parameter, all three are equal.
     :param fixed: values of other parameters on the same scale.
     :param errors: point errors of the fit.
     """
@@ -110,13 +110,13 @@ class CalibrationTask:
 
     @property
     def about(self) -> dict[str, Any]:
-        """Plain values that tell a reader of the journal which calibration it is."""
+        """Plain values that identify the calibration for a reader of the journal."""
         return {'object': self.dlo.name, 'engine': self.engine}
 
     @functools.cached_property
     def key(self) -> str:
         """A digest of all that the outcome depends on."""
-        return task_digest(CODE, self.engine, self.observed.trials, effective(self.observed.options))
+        return task_digest(CODE, self.engine, self.observed.trials, recordable(self.observed.options.flat()))
 
 
 def learn(task: CalibrationTask, make_simulator: SimulatorFactory,
@@ -140,9 +140,9 @@ def learn(task: CalibrationTask, make_simulator: SimulatorFactory,
 
 
 class Planner(Protocol):
-    """What `plan` is called with here."""
+    """The arguments with which `plan` is called here."""
 
-    def __call__(self, found: Belief, start: Chain, goal: Chain, options: PlanOptions, *,
+    def __call__(self, dlo: Belief, start: Chain, goal: Chain, options: PlanOptions, *,
                  simulation: Options, should_stop: Callable[[], bool]) -> Plan:
         """Return a plan."""
 
@@ -166,7 +166,7 @@ class PlanTask:
 
     @property
     def about(self) -> dict[str, Any]:
-        """Plain values that tell a reader of the journal which plans they are."""
+        """Plain values that identify the plans for a reader of the journal."""
         return {'object': self.dlo.name, 'parameters': self.belief.kind, 'pair': self.index + 1,
                 'seed': self.seed, 'engine': self.engine}
 
@@ -179,7 +179,7 @@ class PlanTask:
 @dataclass(frozen=True)
 class Execution:
     """
-    What the actions of one or more plans did to the DLO in reality.
+    The outcome of the actions of one or more plans in reality.
 
     :param errors: mean distance of the points from the goal, before and after each action [% of the length].
     :param scores: difference score likewise [cm].
@@ -206,10 +206,9 @@ class Execution:
 @dataclass(frozen=True)
 class PlanOutcome:
     """
-    What the plans of a task led to.
+    The executions of the plans of a task; None if there was no plan at all.
 
-    :param failure: why a plan, or reality, failed; empty if none did.  An execution ends there; it is None if
-        there was no plan at all.
+    :param failure: why a plan, or reality, failed; empty if none did.  An execution ends there.
     """
 
     open_loop: Execution | None
@@ -285,7 +284,7 @@ def execute(task: PlanTask, make_simulator: SimulatorFactory, planner: Planner,
         goal = Chain(seen(pair.goal.points))
 
         def timed_plan(start: Floats, actions: int) -> tuple[Plan, float]:
-            """Return a plan from (n, 3) points [m] with at most so many actions, and the time it took [s]."""
+            """Return a plan from (n, 3) points [m] with at most `actions` actions, and its duration [s]."""
             begun = time.monotonic()
             plan = planner(task.belief, Chain(start), goal, replace(task.options, actions=actions),
                            simulation=simulation, should_stop=should_stop)
@@ -315,7 +314,7 @@ def _replan(execution: _PlanExecution, timed_plan: Callable[[Floats, int], tuple
     while actions := execution.plans[-1][0].actions:
         execution.act(actions[0].action)
         points = execution.seen + camera.normal(0.0, NOISE, execution.seen.shape)
-        left = REPLANNED_ACTIONS - execution.actions
-        if not left or execution.error(points) <= task.options.tolerance:
+        remaining = REPLANNED_ACTIONS - execution.actions
+        if not remaining or execution.error(points) <= task.options.tolerance:
             return
-        execution.plans.append(timed_plan(points, min(left, task.options.actions)))
+        execution.plans.append(timed_plan(points, min(remaining, task.options.actions)))

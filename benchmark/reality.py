@@ -30,7 +30,7 @@ APART = 4.0  # smallest distance between parts that are no neighbours, in radii
 APART_ALONG = 12.0  # they are no neighbours if more of the DLO lies between them, in radii
 DISTANCE = (0.15, 0.30)  # mean distance of the points of start and goal, as a share of the length
 TURN = np.pi / 3  # largest rotation between start and goal
-TRIES = 1000  # shapes that are drawn for one pair
+TRIES = 1000  # largest number of shapes that are drawn for one pair
 HAND_REACH = 0.02  # m; a hand that closes further from the DLO grips nothing
 
 
@@ -94,7 +94,7 @@ def seen(points: Floats) -> Floats:
     return points[..., ::SEEN, :]
 
 
-def share_apart(dlo: KnownDlo, points: Floats, others: Floats) -> float:
+def relative_distance(dlo: KnownDlo, points: Floats, others: Floats) -> float:
     """Return the mean distance of the seen points of two (81, 3) chains [m], as a share of the length."""
     return float(np.linalg.norm(seen(points) - seen(others), axis=-1).mean()) / dlo.length
 
@@ -104,17 +104,17 @@ def random_pair(dlo: KnownDlo, index: int, seed: int, simulator: Simulator) -> P
     Return a random pair of a DLO; it depends on the seed and its index alone.
 
     Start and goal are random smooth curves without crossings, whose curvature is a sum of MODES cosines.
-    The DLO is laid there and let go, and stays as the simulation leaves it at rest.  The goal is then
-    turned and moved, so that the points are 15 to 30 % of the length apart on average.
+    The DLO is laid there, released, and keeps the shape in which it comes to rest.  The goal is then turned
+    and moved, so that the points are 15 to 30 % of the length apart on average.
 
     :param simulator: simulates with the true properties.
     """
     generator = np.random.default_rng([seed, index])
     start = _shape(dlo, generator, simulator)
-    apart = generator.uniform(*DISTANCE)
+    distance = generator.uniform(*DISTANCE)
     for _ in range(TRIES):
         goal = _moved(_shape(dlo, generator, simulator), generator.uniform(-TURN, TURN), np.zeros(2))
-        if share_apart(dlo, start, goal) < apart:
+        if relative_distance(dlo, start, goal) < distance:
             break
     else:
         raise RuntimeError(f'{dlo.name}: no goal within {TRIES} tries')
@@ -123,7 +123,7 @@ def random_pair(dlo: KnownDlo, index: int, seed: int, simulator: Simulator) -> P
     near, far = 0.0, dlo.length  # [m] too little, and too much
     while far - near > 1e-6:
         middle = (near + far) / 2
-        enough = share_apart(dlo, start, _moved(goal, 0.0, middle * direction)) > apart
+        enough = relative_distance(dlo, start, _moved(goal, 0.0, middle * direction)) > distance
         near, far = (near, middle) if enough else (middle, far)
     return Pair(Chain(start), Chain(_moved(goal, 0.0, far * direction)))
 
@@ -162,7 +162,7 @@ def _shape(dlo: KnownDlo, generator: np.random.Generator, simulator: Simulator) 
 
 
 def laid(dlo: KnownDlo, points: Floats, simulator: Simulator) -> Floats:
-    """Return where a DLO that is laid at (81, 3) points [m] and let go comes to rest."""
+    """Return the points at rest of a DLO that is laid at (81, 3) points [m] and released."""
     middle = len(points) // 2
     hand = Hand('hand_1', (middle,), np.array([0.0, 0.01]), points[[middle, middle]])
     job = RehearsalJob(Chain(points), (ActionStep(Action((hand,))),), dlo.physical)
@@ -179,7 +179,7 @@ def _moved(points: Floats, angle: float, offset: Floats) -> Floats:
 
 class Reality:
     """
-    A DLO on a table, on which hands act as a plan says, wherever the DLO may be.
+    A DLO on a table, in which hands execute planned actions, wherever the DLO may be.
 
     A hand closes at its first waypoint and grips the point of the DLO that is nearest to it, if that is
     within HAND_REACH.  Then it moves along its path, with the grip as far from its middle as when it closed.
@@ -196,7 +196,7 @@ class Reality:
 
     @property
     def steps(self) -> tuple[ActionStep, ...]:
-        """What the hands really did so far."""
+        """The executed steps so far."""
         return tuple(self._steps)
 
     def act(self, action: Action) -> bool:
@@ -207,7 +207,7 @@ class Reality:
         """
         hands = tuple(hand for planned in action.hands if (hand := self._gripping(planned)) is not None)
         if hands:
-            # All actions are simulated again, as a chain alone does not tell how much the DLO is stretched.
+            # All actions are simulated again, because a chain does not show how much the DLO is stretched.
             steps = (*self._steps, ActionStep(Action(hands)))
             rehearsal, = rehearse(self._pool, [RehearsalJob(self._start, steps, self._physical)])
             if rehearsal.failure:

@@ -40,44 +40,45 @@ Replay = Callable[[Any, Trial, list[Grip], float], Floats]
 
 
 def grips(trial: Trial, until: float) -> list[Grip]:
-    """Return the grips of a trial; those that still hold at the goal hold to the end, [s]."""
-    found = []
+    """Return the grips of a trial; those that hold at the last goal hold until the end [s]."""
+    held = []
     for hand in trial.hands:
         times, positions = np.array(hand.times), np.array(hand.positions)
         if trial.holds(hand, trial.goals[-1]):
             times, positions = np.append(times, until + 1), np.vstack([positions, positions[-1:]])
         start = positions[0] - trial.initial.points[list(hand.grips)].mean(axis=0) * (len(hand.grips) > 1)
         for grip in hand.grips:
-            apart = trial.initial.points[grip] + start - positions[0] if len(hand.grips) > 1 else 0.0
-            found.append(Grip(grip, times, positions + apart))
-    return found
+            offset = trial.initial.points[grip] + start - positions[0] if len(hand.grips) > 1 else 0.0
+            held.append(Grip(grip, times, positions + offset))
+    return held
 
 
 def compared(folder: Path, replay: Replay, most: int, names: Sequence[str] = OBJECTS) -> str:
     """
-    Return a table of objects, fitted on four trials each, in at most so many other trials each.
+    Return a table of objects, fitted on four trials each, in at most `most` other trials each.
 
-    :param folder: for results; one that is there already is used.
+    :param folder: for results; existing ones are used.
     """
     rows = []
     for name in names:
         if not (folder / name / 'result.xml').exists():
             fit(convert('reference', name, folder / f'{name}_session'), folder / name)
-        found = read_result(folder / name / 'result.xml')
+        result = read_result(folder / name / 'result.xml')
         if not (folder / f'{name}_other').exists():
             convert('reference', name, folder / f'{name}_other', '--actions', 'other')
-        values = {key: one.value for key, one in found.parameters.items()}
+        values = {key: estimate.value for key, estimate in result.parameters.items()}
         simulator = CompiledSimulator()
         away: list[list[float]] = [[], [], []]
         for trial in read_session(folder / f'{name}_other').trials[:most]:
             end = max(trial.goals[-1].time, max(hand.end for hand in trial.hands) + SETTLING)
-            ours = simulator.simulate(trial, found.space.physical(values, trial.initial.length)).chains[-1]
-            theirs = replay(found, trial, grips(trial, end), end)
+            ours = simulator.simulate(trial, result.space.physical(values, trial.initial.length)).chains[-1]
+            theirs = replay(result, trial, grips(trial, end), end)
             measured = trial.goals[-1].chain.points
-            for to, one, other in zip(away, (theirs, theirs, ours), (ours, measured, measured), strict=True):
-                to.append(distance(one, other))
-            print(name, trial.name, *(f'{one[-1]:.2f}' for one in away), flush=True)
-        rows.append([name[-1], *(f'{np.mean(one):.2f}' for one in away), f'{max(away[0]):.2f}',
+            pairs = (theirs, ours), (theirs, measured), (ours, measured)
+            for distances, (points, other) in zip(away, pairs, strict=True):
+                distances.append(distance(points, other))
+            print(name, trial.name, *(f'{distances[-1]:.2f}' for distances in away), flush=True)
+        rows.append([name[-1], *(f'{np.mean(distances):.2f}' for distances in away), f'{max(away[0]):.2f}',
                      f'{np.mean(away[1]) / np.mean(away[2]):.2f}'])
     return table(['object', 'from our engine, mm', 'from the measurement, mm',
                   'our engine from the measurement, mm', 'worst trial from our engine, mm',
@@ -88,7 +89,7 @@ def cantilevers(tip: Callable[[float, int], Floats], cases: Iterator[tuple[float
     """
     Return a table of cantilevers at rest.
 
-    :param tip: returns the tip, (3,) [m], of a DLO with EI [N m^2] in so many segments, held by the first.
+    :param tip: returns the tip, [m], of a DLO with EI [N m^2] and a number of segments, the first clamped.
     :param clamp: share of the first segment that does not bend.
     """
     rows = []
@@ -99,9 +100,9 @@ def cantilevers(tip: Callable[[float, int], Floats], cases: Iterator[tuple[float
     return table(['EI, N m²', 'segments', 'tip from the elastica, mm', '% of the length'], rows)
 
 
-def distance(one: Floats, other: Floats) -> float:
+def distance(points: Floats, other: Floats) -> float:
     """Return the mean distance of points, (n, 3) [m] each, in mm."""
-    return 1e3 * float(np.linalg.norm(one - other, axis=1).mean())
+    return 1e3 * float(np.linalg.norm(points - other, axis=1).mean())
 
 
 def elastica(stiffness: float, clamp: float, mass: float = MASS) -> Floats:

@@ -22,7 +22,7 @@ import numpy as np
 
 from dlo_calibration.calibration.engines import make_simulator
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.calibration.prior import prior
+from dlo_calibration.calibration.prior import Prior
 from dlo_calibration.evaluation.evaluation import Evaluator
 from dlo_calibration.evaluation.residuals import Huber
 from dlo_calibration.files.session import read_session
@@ -36,7 +36,7 @@ SHOWN = ('flexibility', 'elasticity', 'friction')
 def search_with(evaluator: Evaluator, options: Options, name: str, seed: int
                 ) -> tuple[list[Observation], Observation]:
     """Return all observations of a search, and the one that is its result."""
-    search = SEARCHES[name](evaluator.space.dimension, seed, prior(evaluator.trials, options).hints)
+    search = SEARCHES[name](evaluator.space.dimension, seed, Prior.of(evaluator.trials, options).hints)
     seen: list[Observation] = []
     while len(seen) < BUDGET:
         points = search.ask(BUDGET - len(seen))
@@ -47,7 +47,7 @@ def search_with(evaluator: Evaluator, options: Options, name: str, seed: int
         seen.extend(Observation(e.point, e.score, e.residuals) for e in evaluations)
     best = search.best
     assert best is not None
-    return seen, next(one for one in seen if (one.point == best).all())
+    return seen, next(observation for observation in seen if (observation.point == best).all())
 
 
 def rows_of(name: str, names: list[str], seeds: int, engine: str) -> list[str]:
@@ -55,24 +55,24 @@ def rows_of(name: str, names: list[str], seeds: int, engine: str) -> list[str]:
     session = read_session(HERE.parent / 'msg_samples' / name, None)
     options = replace(session.options, engine=engine)
     evaluator = Evaluator(session.trials, options.space, make_simulator(options))
-    done = {one: [search_with(evaluator, options, one, seed) for seed in range(seeds)]
-            for one in dict.fromkeys(['random', *names])}
-    target = float(np.median([min(one.score for one in seen) for seen, _ in done['random']]))
-    residuals = {one: [best.residuals for _, best in found] for one, found in done.items()}
-    loss = min(Huber.of(each) for found in residuals.values() for each in found)
-    lowest = min(loss.cost(each) for found in residuals.values() for each in found)
+    done = {method: [search_with(evaluator, options, method, seed) for seed in range(seeds)]
+            for method in dict.fromkeys(['random', *names])}
+    target = float(np.median([min(observation.score for observation in seen) for seen, _ in done['random']]))
+    residuals = {method: [best.residuals for _, best in results] for method, results in done.items()}
+    loss = min(Huber.of(each) for results in residuals.values() for each in results)
+    lowest = min(loss.cost(each) for results in residuals.values() for each in results)
     rows = []
-    for one in names:
-        scores = [np.minimum.accumulate([each.score for each in seen]) for seen, _ in done[one]]
+    for method in names:
+        scores = [np.minimum.accumulate([each.score for each in seen]) for seen, _ in done[method]]
         reached = [int(np.argmax(score <= target)) + 1 if score[-1] <= target else BUDGET + 1
                    for score in scores]
         middle = float(np.median(reached))
-        worst = max(loss.cost(each) for each in residuals[one]) / lowest
-        points = 100 * np.array([best.point for _, best in done[one]])
+        worst = max(loss.cost(each) for each in residuals[method]) / lowest
+        points = 100 * np.array([best.point for _, best in done[method]])
         shown = [list(evaluator.space.free).index(each) for each in SHOWN]
         spread = ' | '.join(f'{points[:, k].mean():.1f} ± {points[:, k].std():.2f}' for k in shown)
         rows.append(
-            f'| {name[-1]} | {one} | {target:.1f} | {f"{middle:g}" if middle <= BUDGET else "not"} '
+            f'| {name[-1]} | {method} | {target:.1f} | {f"{middle:g}" if middle <= BUDGET else "not"} '
             f'| {max(reached) if max(reached) <= BUDGET else "not"} '
             f'| {np.median([len(score) for score in scores]):g} '
             f'| {np.median([score[-1] for score in scores]):.1f} | {spread} | {worst:.2f} |')

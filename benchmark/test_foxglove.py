@@ -55,7 +55,7 @@ def plain(message):
                 if not name.startswith('__') and not name.isupper()}  # those are constants of the type
     if hasattr(message, 'tolist'):
         return message.tolist()
-    return [plain(one) for one in message] if isinstance(message, (list, tuple)) else message
+    return [plain(item) for item in message] if isinstance(message, (list, tuple)) else message
 
 
 def expected(folder):
@@ -69,9 +69,9 @@ def expected(folder):
 @pytest.mark.parametrize('sample', sorted(path.name for path in SAMPLES.glob('object?')))
 def test_foxglove_reads_what_rosbags_reads(foxglove, sample):
     file, = (SAMPLES / sample).glob('*.mcap')
-    found = foxglove('indexed', file)
-    assert found['profile'] == 'ros2'
-    assert found['messages'] == expected(SAMPLES / sample)
+    reading = foxglove('indexed', file)
+    assert reading['profile'] == 'ros2'
+    assert reading['messages'] == expected(SAMPLES / sample)
 
 
 def test_foxglove_reads_what_the_node_tells(foxglove, tmp_path):

@@ -71,28 +71,28 @@ def round_trips(robot):
 
     client = robot._node.create_client(GetParameters, f'{demo_robot.NODE}/get_parameters')
     assert client.wait_for_service(60)
-    request, found = GetParameters.Request(names=['evaluations']), []
+    request, durations = GetParameters.Request(names=['evaluations']), []
     for _ in range(CALLS):
         begun = time.monotonic()
         future = client.call_async(request)
         while not future.done():
             rclpy.spin_once(robot._node, timeout_sec=1.0)
-        found.append(time.monotonic() - begun)
+        durations.append(time.monotonic() - begun)
         time.sleep(PERIOD)
-    return np.array(found)
+    return np.array(durations)
 
 
 @pytest.fixture(scope='module')
 def rows():
     """Collect the rows of a table, and write it to results/load.md."""
-    found = []
-    yield found
+    lines = []
+    yield lines
     RESULTS.write_text(
         '# load\n\n`make bench`: object 1; the node calibrates on all cores, `search` random. Another '
         f'process calls a service of the\nnode {CALLS} times; a timer of the node wants to fire every '
         f'{PERIOD * 1e3:.0f} ms. On a machine that others use, they are in the figures, too.\n\n'
         '| engine | evaluations per s | round trip, median | p99 | max | timer late, median | p99 | max |\n'
-        '|---|---|---|---|---|---|---|---|\n' + '\n'.join(found) + '\n')
+        '|---|---|---|---|---|---|---|---|\n' + '\n'.join(lines) + '\n')
 
 
 @pytest.mark.parametrize('engine', ['none', 'compiled', 'bullet'])

@@ -52,14 +52,14 @@ def memory(name, rounds):
 @pytest.fixture(scope='module')
 def rows():
     """Collect the rows, and write the table when it is complete."""
-    found = []
-    yield found
-    if len(found) == len(ROUNDS):
+    lines = []
+    yield lines
+    if len(lines) == len(ROUNDS):
         write('memory', 'make bench', 'Rounds (one settled trial) of object 1 with random parameters, in a '
               f'process of their own; resident memory, at {LOOKS} instants. The slope is that of a line '
               f'through those after the first {WARM:.0%} of the rounds.',
               table(['engine', 'rounds', f'MB after {WARM:.0%}', 'MB at the end',
-                     'slope, kB per 1000 rounds', 'all rounds, s'], found))
+                     'slope, kB per 1000 rounds', 'all rounds, s'], lines))
 
 
 @pytest.mark.parametrize('engine', ROUNDS)

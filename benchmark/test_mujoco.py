@@ -10,17 +10,17 @@ from figures import SAMPLES, side_by_side, table, write
 from lxml import etree
 import numpy as np
 import pytest
-from scipy.integrate import solve_bvp
+from replays import elastica, LENGTH, MASS
 
 from dlo_calibration import Action, Chain, export_mjcf, Goal, Hand, Options, read_result, Trial
-from dlo_calibration.model.parameters import BY_NAME, GRAVITY
+from dlo_calibration.model.parameters import BY_NAME
 from dlo_calibration.simulation.bullet import BulletSimulator
 from dlo_calibration.simulation.compiled import CompiledSimulator
 from dlo_calibration.simulation.protocol import DEFAULT_TIME_STEP
 
 mujoco = pytest.importorskip('mujoco', reason='needs MuJoCo: the extra "bench" of setup.py has it')
 
-LENGTH, MASS, RADIUS = 0.6, 0.03, 0.004  # m, kg, m
+RADIUS = 0.004  # m
 STIFFNESS = 0.02  # EI, N m^2
 PHYSICAL = {'flexibility': STIFFNESS, 'elasticity': 1e4, 'self_collision': RADIUS, 'damping': 0.01,
             'internal_damping': 0.1}
@@ -41,8 +41,9 @@ def dlo():
     """Return the definition of the DLO."""
     sample = read_result(SAMPLES / 'xml/dlo.xml')
     values = {name: BY_NAME[name].value(value) for name, value in PHYSICAL.items()}
-    return replace(sample, mass=MASS, length=LENGTH, fixed={**sample.fixed, **values}, parameters={
-        name: replace(one, value=values.get(name, one.value)) for name, one in sample.parameters.items()})
+    parameters = {name: replace(estimate, value=values.get(name, estimate.value))
+                  for name, estimate in sample.parameters.items()}
+    return replace(sample, mass=MASS, length=LENGTH, fixed={**sample.fixed, **values}, parameters=parameters)
 
 
 def start(elements):
@@ -75,35 +76,20 @@ def cantilever(elements):
     chain = start(elements)
     hand = Hand('clamp', (0, 1), [0.0, 0.01], [[0, 0, 0], [0, 0, 0]])
     goal = Goal(chain, SECONDS, stable=False, held_by=('clamp',))
-    found = dlo()
-    return Trial('falls', chain, (Action((hand,)),), (goal,)), found.space.physical(found.values, LENGTH)
-
-
-def elastica(clamp):
-    """Return the tip [m] of a cantilever at rest under its weight, relative to the clamp, by the elastica."""
-    load = MASS / LENGTH * GRAVITY
-    free = LENGTH - clamp
-
-    def change(s, y):
-        return np.stack([y[1], load * (free - s) * np.cos(y[0]) / STIFFNESS, np.cos(y[0]), np.sin(y[0])])
-
-    s = np.linspace(0, free, 200)
-    guess = np.stack([-s / free, -1 / free + 0 * s, clamp + s, -s / 2])
-    solution = solve_bvp(change, lambda a, b: np.array([a[0], b[1], a[2] - clamp, a[3]]), s, guess,
-                         tol=1e-6, max_nodes=20000)
-    assert solution.success
-    return np.array([solution.y[2, -1], 0.0, solution.y[3, -1]])
+    description = dlo()
+    physical = description.space.physical(description.values, LENGTH)
+    return Trial('falls', chain, (Action((hand,)),), (goal,)), physical
 
 
 @pytest.fixture(scope='module')
 def rows():
     """Collect the rows, and write the table when it is complete."""
-    found = []
-    yield found
-    if len(found) == 3 * len(ELEMENTS):
+    lines = []
+    yield lines
+    if len(lines) == 3 * len(ELEMENTS):
         write('mujoco', 'make bench', HOW.format(mujoco.__version__),
               table(['elements', 'engine', 'step, ms', 'ms per simulated second', 'µs per step',
-                     'times compiled', 'tip to elastica, mm'], found))
+                     'times compiled', 'tip to elastica, mm'], lines))
 
 
 @pytest.mark.benchmark(timer=time.process_time)
@@ -120,7 +106,7 @@ def test_cantilever(benchmark, elements, rows):
     bullet.close()
     for name, shape in shapes.items():
         step = exported.model.opt.timestep if name == 'mujoco' else DEFAULT_TIME_STEP
-        expected = elastica(LENGTH / elements * (0.5 if name == 'mujoco' else 1))
+        expected = elastica(STIFFNESS, LENGTH / elements * (0.5 if name == 'mujoco' else 1))
         rows.append([elements, name, f'{1e3 * step:g}', f'{1e3 * seconds[name] / SECONDS:.2f}',
                      f'{1e6 * seconds[name] * step / SECONDS:.1f}',
                      f'{seconds[name] / seconds["compiled"]:.1f}',

@@ -43,7 +43,7 @@ def tables():
     speeds, trials, parts, cables, together = [], [], [], [], []
     yield speeds, trials, parts, cables, together
     wanted = [len(NODES), len(ACTIONS), len(TOGETHER), 5]
-    if [len(one) for one in (parts, trials, together, cables)] != wanted:
+    if [len(lines) for lines in (parts, trials, together, cables)] != wanted:
         return  # a part was measured alone
     nodes = np.log([row[0] for row in speeds])
     growth = [np.polyfit(nodes, np.log([row[column] for row in speeds]), 1)[0] for column in (4, 5)]
@@ -120,8 +120,8 @@ def test_cables(benchmark, tables):
     seconds = side_by_side(benchmark, {
         name: lambda physical=physical: core.roll_out([(script, start, physical, NO_TABLE)], 0.003)
         for name, physical in cables.items()}, 10 * ROUNDS)
-    tables[3].extend([name, f'{1e6 * taken / count:.1f}', f'{taken / seconds["plain"]:.2f}']
-                     for name, taken in seconds.items())
+    tables[3].extend([name, f'{1e6 * elapsed / count:.1f}', f'{elapsed / seconds["plain"]:.2f}']
+                     for name, elapsed in seconds.items())
 
 
 def swung():
@@ -146,9 +146,9 @@ def test_together(benchmark, name, tables):
     simulator.simulate_together(jobs, Stop())
     seconds = side_by_side(benchmark, {'alone': lambda: [simulator.simulate(*job) for job in jobs],
                                        'together': lambda: simulator.simulate_together(jobs, Stop())}, ROUNDS)
-    rates = [len(jobs) / one for one in seconds.values()]
+    rates = [len(jobs) / elapsed for elapsed in seconds.values()]
     tables[4].append([name, len(jobs), *(f'{rate:.0f}' for rate in rates), f'{rates[1] / rates[0]:.2f}',
-                      *(f'{1e6 * one / steps:.2f}' for one in seconds.values())])
+                      *(f'{1e6 * elapsed / steps:.2f}' for elapsed in seconds.values())])
 
 
 @pytest.mark.benchmark(timer=time.process_time)

@@ -75,19 +75,19 @@ def fit(folder):
     times.append(time.time())
     process.communicate(timeout=PATIENCE)
     assert process.returncode == 0
-    return [one - begun for one in (float(note.read_text()), *times, time.time())]
+    return [instant - begun for instant in (float(note.read_text()), *times, time.time())]
 
 
 @pytest.fixture(scope='module')
 def rows():
     """Collect the rows, and write the table."""
-    found = []
-    yield found
-    if found:
+    lines = []
+    yield lines
+    if lines:
         write('startup', 'make bench', f'Wall clock from the start of the process; shortest of {ROUNDS} '
               f'repetitions. Loaded of '
               f'{", ".join(SLOW)}, as `python -X importtime` says.',
-              table(['command', 'seconds', 'loads'], found))
+              table(['command', 'seconds', 'loads'], lines))
 
 
 @pytest.mark.parametrize('name', COMMANDS)
@@ -105,7 +105,8 @@ def test_startup(benchmark, name, rows, tmp_path, monkeypatch):
     benchmark.pedantic(take, rounds=ROUNDS, warmup_rounds=1)
     *lines, _ = finish(words, '-X', 'importtime')
     loaded = {line.rpartition('|')[2].strip() for line in lines}
-    rows.append([name, f'{min(times[1:]):.2f}', ', '.join(one for one in SLOW if one in loaded) or 'none'])
+    slow = ', '.join(library for library in SLOW if library in loaded)
+    rows.append([name, f'{min(times[1:]):.2f}', slow or 'none'])
 
 
 def test_fit(benchmark, rows, tmp_path):

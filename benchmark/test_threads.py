@@ -27,22 +27,22 @@ ROUNDS = 3
 EVALUATIONS = 150
 WORKERS = (1, 2)
 MEASURED = {'compiled': 150, 'bullet': 6}  # engine -> evaluations
-STAGES = {'imports': 'drafter and imports', 'reading': 'session',
+STAGES = {'imports': 'interpreter and imports', 'reading': 'session',
           'first': 'until the first evaluation', 'rounds': 'the other evaluations',
           'closing': 'end of the calibration', 'writing': 'report, pictures, files',
-          'end': 'end of the drafter'}
+          'end': 'end of the interpreter'}
 
 
 @pytest.fixture(scope='module')
 def rows():
     """Collect the rows, and write the table when it is complete."""
-    found = []
-    yield found
-    if len(found) == len(MEASURED) * len(WORKERS):
+    lines = []
+    yield lines
+    if len(lines) == len(MEASURED) * len(WORKERS):
         write('threads', 'make bench', '`calibrate` on the four trials of object 1, random search; '
               f'shortest wall clock of {ROUNDS} repetitions, in which the numbers of threads take turns. '
               f'{cores()} cores may be used.',
-              table(['engine', 'evaluations', 'threads', 'seconds', 'speed-up', 'efficiency'], found))
+              table(['engine', 'evaluations', 'threads', 'seconds', 'speed-up', 'efficiency'], lines))
 
 
 @pytest.mark.benchmark(timer=time.perf_counter)
@@ -107,15 +107,15 @@ def fit_of(folder, engine, workers):
 
 def test_fit(benchmark, tmp_path, fits):
     engine = next(iter(MEASURED))
-    found = {workers: [] for workers in WORKERS}
+    stages_of = {workers: [] for workers in WORKERS}
     fit_of(tmp_path / 'warm', engine, WORKERS[-1])  # fills the caches
 
     def take():
-        for workers, stages in found.items():
+        for workers, stages in stages_of.items():
             stages.append(fit_of(tmp_path / f'{workers}', engine, workers))
 
     benchmark.pedantic(take, rounds=ROUNDS)
-    for workers, repetitions in found.items():
+    for workers, repetitions in stages_of.items():
         best = min(repetitions, key=lambda stages: stages['whole'])
         fits.append([engine, workers, *(f'{best[stage]:.2f}' for stage in ('whole', *STAGES))])
 

@@ -8,7 +8,7 @@ Measure what calibration is worth: plans with fitted, default and true parameter
 
 Each of the five samples is calibrated on its trials, and gets random pairs of a start and a goal.
 Reality is a finer simulation with the true properties.
-Plans that DIR has already are not made again.  The tables are printed, and written to DIR.
+Plans that are already in DIR are not made again.  The tables are printed, and written to DIR.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import functools
 from pathlib import Path
 import shlex
 import sys
-from typing import Callable, Mapping, TextIO
+from typing import Mapping
 
 from plan_executions import (
     Belief,
@@ -40,13 +40,13 @@ from dlo_calibration.calibration.engines import make_simulator, SimulatorFactory
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.cli.output import print_message
 from dlo_calibration.errors import DloCalibrationError, InputError
-from dlo_calibration.experiment.journal import performed
+from dlo_calibration.experiment.journal import Journal, Laboratory
 from dlo_calibration.experiment.study import Observed
 from dlo_calibration.files.session import read_session, samples
 from dlo_calibration.planning.options import PlanOptions
 from dlo_calibration.planning.planner import plan
 from dlo_calibration.signals import StopFlag
-from dlo_calibration.writing import Attempts, make_folder, whole
+from dlo_calibration.writing import whole
 
 NAMES = tuple(dlo.name for dlo in KNOWN_DLOS)
 BELIEFS, PLANS = 'knowledge.jsonl', 'plans.jsonl'  # journals in the folder of the experiment
@@ -55,11 +55,10 @@ BELIEFS, PLANS = 'knowledge.jsonl', 'plans.jsonl'  # journals in the folder of t
 @dataclass(frozen=True)
 class WorthStudy:
     """
-    What the experiment does.
+    The plan of the experiment.
 
     :param observed: trials of each object, on which it is calibrated.
     :param pairs: number of starts and goals of each object, from the random `seed`.
-    :param workers: threads; 0: one per core.
     :param command: that repeats the experiment.
     """
 
@@ -67,7 +66,6 @@ class WorthStudy:
     pairs: int
     seed: int
     options: PlanOptions
-    workers: int
     command: str
 
     def __post_init__(self) -> None:
@@ -75,27 +73,22 @@ class WorthStudy:
             raise InputError('--pairs', str(self.pairs), '1 or more', 'correct it')
 
 
-def conduct_worth(study: WorthStudy, folder: Path, make_simulator: SimulatorFactory,
-                  stop: Callable[[], bool], note: Callable[[str], None], stream: TextIO,
-                  planner: Planner = plan) -> tuple[str, Attempts]:
+def conduct_worth(study: WorthStudy, laboratory: Laboratory, make_simulator: SimulatorFactory,
+                  planner: Planner = plan) -> str:
     """
-    Make the plans that are not in `folder` yet, then write tables and a picture of all.
+    Make the plans that the laboratory lacks, then write tables and a picture of all.
 
-    :param note: called with each sentence for the user.
-    :param stream: for a progress bar.
-    :returns: the tables, empty if no plan is done; and the files that could not be written.
-    :raises InputError: if `folder` cannot be made, or a journal cannot be read.
+    :returns: the tables; empty if no plan is done.
+    :raises InputError: if a journal cannot be read.
     """
-    make_folder(folder)
-    attempts = Attempts(folder)
+    folder, attempts = laboratory.folder, laboratory.attempts
     with closing(make_simulator(Options())) as simulator:
         engine = simulator.name
-    tasks = _tasks(study, folder, make_simulator, engine, attempts, stop, note, stream)
-    done = performed('plans', tasks, folder / PLANS, PlanOutcome.of,
-                     functools.partial(execute, make_simulator=make_simulator, planner=planner),
-                     study.workers, attempts, stop, note, stream)
+    done = laboratory.outcomes(
+        'plans', _tasks(study, laboratory, make_simulator, engine), Journal(folder / PLANS, PlanOutcome.of),
+        functools.partial(execute, make_simulator=make_simulator, planner=planner))
     if not done:
-        return '', attempts
+        return ''
     wanted = 3 * len(study.observed) * study.pairs
     text = worth_tables.markdown(done, study.command, engine, len(done) == wanted)
     for name, content in (('worth.md', text), ('worth.csv', worth_tables.executions_csv(done))):
@@ -104,19 +97,19 @@ def conduct_worth(study: WorthStudy, folder: Path, make_simulator: SimulatorFact
     with attempts.attempt('worth.png'):
         worth_tables.picture(done, folder / 'worth.png')
     if len(done) < wanted:
-        note(f'interrupted: {len(done)} of {wanted} are done; the same command continues with the others')
-    return text, attempts
+        laboratory.report(
+            f'interrupted: {len(done)} of {wanted} are done; the same command continues with the others')
+    return text
 
 
-def _tasks(study: WorthStudy, folder: Path, make_simulator: SimulatorFactory, engine: str,
-           attempts: Attempts, stop: Callable[[], bool], note: Callable[[str], None], stream: TextIO
+def _tasks(study: WorthStudy, laboratory: Laboratory, make_simulator: SimulatorFactory, engine: str
            ) -> list[PlanTask]:
-    """Return the first pair of all objects, then the second; calibrate the objects before."""
-    calibrations = [CalibrationTask(dlo, observed, engine) for dlo, observed in study.observed.items()]
-    fitted = performed('calibrations', calibrations, folder / BELIEFS, Belief.of,
-                       functools.partial(learn, make_simulator=make_simulator), study.workers, attempts, stop,
-                       note, stream)
-    certain = replace(study.options, draws=0)  # without doubt, all draws would be the same
+    """Calibrate the objects; return the first pair of all objects, then the second."""
+    fitted = laboratory.outcomes(
+        'calibrations', [CalibrationTask(dlo, observed, engine) for dlo, observed in study.observed.items()],
+        Journal(laboratory.folder / BELIEFS, Belief.of),
+        functools.partial(learn, make_simulator=make_simulator))
+    certain = replace(study.options, draws=0)  # without uncertainty, all draws would be the same
     tasks = []
     for index in range(study.pairs):
         for calibration, belief in fitted:
@@ -145,12 +138,12 @@ def main() -> int:
             observed[dlo] = Observed(session.trials, session.options)
     command = ['python', 'benchmark/worth.py', '--pairs', str(chosen.pairs), '--seed', str(chosen.seed)]
     command += [] if len(observed) == len(NAMES) else ['--objects', *chosen.objects]
-    study = WorthStudy(observed, chosen.pairs, chosen.seed, PlanOptions(workers=1), chosen.workers,
-                       shlex.join(command))
+    study = WorthStudy(observed, chosen.pairs, chosen.seed, PlanOptions(workers=1), shlex.join(command))
     with StopFlag() as stop:
-        text, attempts = conduct_worth(study, chosen.output, make_simulator, stop, print_message, sys.stderr)
+        laboratory = Laboratory(chosen.output, chosen.workers, stop, print_message, sys.stderr)
+        text = conduct_worth(study, laboratory, make_simulator)
     print(text)
-    attempts.require()
+    laboratory.attempts.require()
     return stop.exit_code if stop() else 0
 
 

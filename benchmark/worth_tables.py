@@ -49,7 +49,7 @@ ALL = 'all'
 @dataclass(frozen=True)
 class TableRow:
     """
-    What plans with one kind of parameters led to; errors are in % of the length, after all actions.
+    The outcome of plans with one kind of parameters; errors are in % of the length, after all actions.
 
     :param subject: name of the object, or ALL.
     :param pairs: number of them; the following are over all.
@@ -171,20 +171,20 @@ def picture(done: Done, path: Path) -> None:
         axes = figure.subplots(len(WAYS), len(subjects), sharex=True, sharey=True, squeeze=False)
         for row, (way, words) in zip(axes, WAYS.items(), strict=True):
             row[0].set_ylabel(f'{words}: share of pairs, %')
-            for one, subject in zip(row, subjects, strict=True):
-                one.axvline(NEAR, color='0.8', linewidth=0.8)
+            for panel, subject in zip(row, subjects, strict=True):
+                panel.axvline(NEAR, color='0.8', linewidth=0.8)
                 for kind in KINDS:
                     errors = np.sort([each.errors[-1] for each in executions(done, way, subject, kind)])
                     shares = 100 * np.arange(1, len(errors) + 1) / max(len(errors), 1)
-                    one.step([TICKS[0] / 100, *errors, 100], [0, *shares, 100], where='post', linewidth=1.8,
+                    panel.step([TICKS[0] / 100, *errors, 100], [0, *shares, 100], where='post', linewidth=1.8,
                              label=f'{kind} parameters', color=COLOURS[kind], linestyle=STYLES[kind])
-                one.set(xscale='log', xlim=(0.1, 40), ylim=(0, 102))
-                one.set_xticks(TICKS, [f'{tick:g}' for tick in TICKS])
-                one.minorticks_off()
-        for one, subject in zip(axes[0], subjects, strict=True):
-            one.set_title(as_text(subject))
-        for one in axes[-1]:
-            one.set_xlabel('error at the end, % of the length')
+                panel.set(xscale='log', xlim=(0.1, 40), ylim=(0, 102))
+                panel.set_xticks(TICKS, [f'{tick:g}' for tick in TICKS])
+                panel.minorticks_off()
+        for panel, subject in zip(axes[0], subjects, strict=True):
+            panel.set_title(as_text(subject))
+        for panel in axes[-1]:
+            panel.set_xlabel('error at the end, % of the length')
         handles, labels = axes[0][0].get_legend_handles_labels()
         legend_outside(figure, 'upper center', handles=handles, labels=labels, ncols=len(KINDS))
         write_figure(figure, path)

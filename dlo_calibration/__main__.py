@@ -14,7 +14,7 @@ NAME = 'dlo_calibration'
 def main() -> int:
     """Execute the command line of the process; return the exit code, as `cli.main.main` does."""
     end_at_signals('dlo-calibration')
-    # Where they were closed by whoever started the process, Python has none.
+    # Python has no stream where the parent process closed it.
     sys.stdout, sys.stderr = (stream or open(os.devnull, 'w') for stream in (sys.stdout, sys.stderr))
     try:
         from dlo_calibration.cli.main import main as execute

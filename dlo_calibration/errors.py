@@ -4,20 +4,26 @@
 """
 The package's exceptions: one base class, unusable inputs, and simulations that fail.
 
-What came from outside can be in their texts: they are one line, short, and safe to show in a terminal.
+Their texts may quote what came from outside: they are one line, and safe to show in a terminal.  Only what
+came from outside is shortened, never a sentence of the package.
 """
 
 from __future__ import annotations
 
 from difflib import get_close_matches
 import re
-from typing import Iterable, Sequence
+from typing import Iterable
 
 DEFECT = 'this is a defect of dlo_calibration, please report it'  # ends the report of an unexpected error
-LONGEST = 300  # characters of an error's text: a few lines of a terminal, whatever came
+LONGEST = 100  # characters of a quoted text that came from outside
+LONGEST_WORD = 300  # characters without a blank, such as a path
+LONGEST_TEXT = 2000  # characters of a text: more than any of ours
 
 #: Control characters (C0, DEL, C1), separators of lines, bidirectional overrides, and halves of surrogates.
 _UNSAFE = re.compile('[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]')
+#: Texts in quotes; an apostrophe in or after a word is none.
+_QUOTED = re.compile(r"""(?<!\w)(?:'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*")(?!\w)""")
+_LONG_WORD = re.compile(rf'\S{{{LONGEST_WORD + 1},}}')
 
 
 def printable(text: str) -> str:
@@ -38,10 +44,17 @@ def shortened(text: str, most: int = LONGEST) -> str:
     return f'{text[:most - 1 - tail]}…{text[len(text) - tail:]}'
 
 
-def safe_line(text: str, most: int = LONGEST) -> str:
-    """Return a text as one line that is safe to show and has at most `most` characters."""
-    # Twice: escaping megabytes would take long, and makes a text longer.
-    return shortened(printable(shortened(text, 2 * most)), most)
+def safe_line(text: str) -> str:
+    """
+    Return a text as one line that is safe to show.
+
+    Quoted texts and long words, which come from outside, are shortened; sentences are not, unless there are
+    more of them than the package ever writes.
+    """
+    # First and last, as escaping megabytes would take long, and makes a text longer.
+    text = printable(shortened(text, 2 * LONGEST_TEXT))
+    text = _QUOTED.sub(lambda match: shortened(match[0]), text)
+    return shortened(_LONG_WORD.sub(lambda match: shortened(match[0], LONGEST_WORD), text), LONGEST_TEXT)
 
 
 def _escaped(match: re.Match[str]) -> str:
@@ -52,7 +65,7 @@ def _escaped(match: re.Match[str]) -> str:
 
 
 class DloCalibrationError(Exception):
-    """Base of every error that this package raises on purpose; its text has at most 300 characters."""
+    """Base of every error that this package raises on purpose; its text is one safe line."""
 
     def __str__(self) -> str:
         return safe_line(super().__str__())
@@ -63,8 +76,7 @@ class InputError(DloCalibrationError):
     An input that cannot be used.
 
     The message, ``thing: came; expected ...; remedy``, always answers the same four questions, so that its
-    reader can act without opening the code.  Each answer is printable, and shortened if all together are too
-    long.
+    reader can act without opening the code.  Each answer is one safe line.
 
     :param thing: which input, e.g. ``goal_chain stamped 12.5 s``.
     :param came: what is wrong with it: a noun, e.g. ``two hands that grip point 3``, or a statement.
@@ -78,12 +90,7 @@ class InputError(DloCalibrationError):
         super().__init__(*parts)
 
     def __str__(self) -> str:
-        form = '{}: {}; expected {}; {}'
-        most = LONGEST - len(form.format(*[''] * 4))
-        # A user copies the name of the thing, and follows the remedy: these stay whole as long as possible.
-        thing, remedy = _fitting((self.thing, self.remedy), most - 100)
-        came, expected = _fitting((self.came, self.expected), most - len(thing) - len(remedy))
-        return form.format(thing, came, expected, remedy)
+        return f'{self.thing}: {self.came}; expected {self.expected}; {self.remedy}'
 
 
 class SimulationError(DloCalibrationError):
@@ -96,27 +103,19 @@ def one_line(error: BaseException) -> str:
     return ' '.join(': '.join(filter(None, (kind, str(error)))).split())
 
 
-def _fitting(parts: Sequence[str], most: int) -> list[str]:
-    """Return texts with at most `most` characters together; the longest ones are shortened."""
-    limit = max(map(len, parts))
-    while sum(min(len(part), limit) for part in parts) > most:
-        limit -= 1
-    return [shortened(part, limit) for part in parts]
+def one_of(valid: Iterable[str], name: str) -> str:
+    """Say which names are expected: all valid ones, or the most similar to `name` if there are many."""
+    valid = list(valid)
+    if len(valid) <= 8:  # they fit into an error
+        return f'one of {", ".join(valid)}'
+    near = get_close_matches(shortened(name), valid, n=3, cutoff=0)
+    return f'one of {", ".join(near)} or {len(valid) - len(near)} others'
 
 
-def one_of(known: Iterable[str], name: str) -> str:
-    """Say which names are expected: all that are known, or the most similar ones if there are many."""
-    known = list(known)
-    if len(known) <= 8:  # they fit into an error
-        return f'one of {", ".join(known)}'
-    near = get_close_matches(shortened(name), known, n=3, cutoff=0)
-    return f'one of {", ".join(near)} or {len(known) - len(near)} others'
-
-
-def suggestion(name: str, known: Iterable[str], otherwise: str) -> str:
-    """Return the remedy for an unknown name: the most similar known one; if none is similar, `otherwise`."""
-    plain = {_plain(one): one for one in known}
-    near = get_close_matches(_plain(shortened(name, 100)), plain, n=1)
+def suggestion(name: str, valid: Iterable[str], otherwise: str) -> str:
+    """Return the remedy for an unknown name: the most similar valid one; if none is similar, `otherwise`."""
+    plain = {_plain(candidate): candidate for candidate in valid}
+    near = get_close_matches(_plain(shortened(name)), plain, n=1)
     return f'did you mean {plain[near[0]]}?' if near else otherwise
 
 

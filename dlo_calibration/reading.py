@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Reading files of strangers: only regular files, and YAML within limits and without aliases."""
+"""Reading strangers' files: only regular files, and YAML within limits and without aliases."""
 
 from __future__ import annotations
 
@@ -29,9 +29,10 @@ MAXIMUM_DEPTH = 20  # rosbag2 needs 6
 
 def require_file(path: Path, thing: str, expected: str) -> None:
     """
-    Refuse what would block or never end when it is read: a FIFO, a socket, a device, a folder.
+    Refuse a FIFO, a socket, a device and a folder: to read them could block or never end.
 
-    :raises InputError: where `path` is no regular file; OSError where it cannot be looked at.
+    :raises InputError: if `path` is no regular file.
+    :raises OSError: if there is nothing, or it cannot be accessed.
     """
     mode = path.stat().st_mode
     if not stat.S_ISREG(mode):
@@ -43,10 +44,10 @@ def require_file(path: Path, thing: str, expected: str) -> None:
 
 def read_octets(path: Path, thing: str, expected: str, most: int) -> bytes:
     """
-    Return the content of a file of a stranger, of which at most `most` + 1 bytes are read.
+    Return the content of a stranger's file, at most `most` + 1 bytes.
 
-    :param thing: what it is called in errors.
-    :raises InputError: where it cannot be read.
+    :param thing: its name in errors.
+    :raises InputError: if it cannot be read.
     """
     try:
         require_file(path, thing, expected)
@@ -57,11 +58,11 @@ def read_octets(path: Path, thing: str, expected: str, most: int) -> bytes:
                          'check the path') from error
 
 
-def read_first(octets: bytes) -> Any:
+def parse_yaml(octets: bytes) -> Any:
     """
-    Return the first document in a file's content; every scalar in it is text.
+    Return the first document of a YAML file; every scalar in it is text.
 
-    :raises Exception: of any kind, as damaged YAML can raise anything.
+    :raises Exception: of any kind, because damaged YAML can raise anything.
     """
     if b'\0' in octets:
         raise ValueError('no text')
@@ -71,9 +72,9 @@ def read_first(octets: bytes) -> Any:
 
 def _plain(events: Iterator[Event], depth: int = 0) -> Any:
     """
-    Return the value that comes next: text, a list or a dict; None for the end of a list or a dict.
+    Return the next value: text, a list or a dict; None at the end of a list or a dict.
 
-    :raises Exception: of any kind, where the events end, and for aliases, as a few make millions of values.
+    :raises Exception: of any kind, if the events end; for an alias, because a few make millions of values.
     """
     event = next(events)
     if isinstance(event, AliasEvent) or depth > MAXIMUM_DEPTH:

@@ -13,23 +13,31 @@ from __future__ import annotations
 import os
 import signal
 import threading
+import time
 from types import FrameType
 from typing import Any
 
 from dlo_calibration.writing import remove_unfinished
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)  # from Ctrl-C; from `kill` and `ros2 launch`
+PATIENCE = 0.5  # s that the main thread has to call the handler of a signal
 
 
 def end_at_signals(program: str) -> None:
     """
     From now on, let a signal end the process at once, with a line on stderr and `exit_code`.
 
+    Python calls a handler only when the main thread returns from C.  A stranger's file may keep a C library
+    busy for hours, so a thread waits for signals, too: SQLite, libxml2 and Pillow let it run meanwhile.
+
     Child processes that simulate end with this one.
     """
-    def end(number: int, frame: FrameType | None) -> None:
+    def handle(number: int, frame: FrameType | None) -> None:
         for other in SIGNALS:
             signal.signal(other, signal.SIG_IGN)  # a second one would end it again, with a second line
+        end(number)
+
+    def end(number: int) -> None:
         remove_unfinished()
         try:
             os.write(2, f'{program}: interrupted\n'.encode())  # sys.stderr may be in use at this moment
@@ -37,8 +45,20 @@ def end_at_signals(program: str) -> None:
             pass  # nobody listens
         os._exit(exit_code(number))
 
-    for one in SIGNALS:
-        signal.signal(one, end)
+    def watch() -> None:
+        while True:
+            number = os.read(receiver, 1)[0]
+            if signal.getsignal(number) is handle:
+                time.sleep(PATIENCE)
+                if signal.getsignal(number) is handle:  # it has not been called
+                    end(number)
+
+    receiver, sender = os.pipe()
+    os.set_blocking(sender, False)
+    signal.set_wakeup_fd(sender, warn_on_full_buffer=False)  # gets the number of each signal at once
+    threading.Thread(target=watch, daemon=True).start()
+    for number in SIGNALS:
+        signal.signal(number, handle)
 
 
 def exit_code(number: int) -> int:

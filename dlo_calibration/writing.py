@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Writing: files that are whole or not there at all, whatever happens to the disk or the process."""
+"""Writing: a file is complete or absent, whatever happens to the disk or the process."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def remove_unfinished() -> None:
 
 @contextmanager
 def _temporary(folder: Path, suffix: str = '') -> Iterator[Path]:
-    """Give a path at which a file may be made, and remove that file when the block ends."""
+    """Give the path of a temporary file, and remove the file when the block ends."""
     path = folder / f'.unfinished_{os.urandom(8).hex()}{suffix}'  # nobody else can know it
     _unfinished.add(path)
     try:
@@ -50,12 +50,12 @@ def scratch_folder() -> Iterator[Path]:
     """
     Give a temporary folder, and remove it when the block ends or a signal ends the process.
 
-    A process that is killed leaves its folder.  The next one to need such a folder removes it: the lock on
-    the folder has gone with the process that held it.
+    A killed process leaves its folder.  The next process that needs such a folder removes it, because no
+    process holds its lock any longer.
     """
-    for left in Path(tempfile.gettempdir()).glob(f'{SCRATCH}*'):
-        with suppress(OSError), _locked(left, fcntl.LOCK_EX | fcntl.LOCK_NB):
-            shutil.rmtree(left)
+    for abandoned in Path(tempfile.gettempdir()).glob(f'{SCRATCH}*'):
+        with suppress(OSError), _locked(abandoned, fcntl.LOCK_EX | fcntl.LOCK_NB):
+            shutil.rmtree(abandoned)
     while True:
         folder = Path(tempfile.mkdtemp(prefix=SCRATCH))
         with _locked(folder, fcntl.LOCK_EX):
@@ -92,7 +92,7 @@ def replacing(path: Path, fsync: bool = True) -> Iterator[Path]:
     """
     Give the path of a new file, which takes the place of `path` when the block ends without an error.
 
-    After an error, `path` is as before, and nothing else is left.  A link at `path` is replaced, not
+    After an error, `path` is as before, and no temporary file remains.  A link at `path` is replaced, not
     followed; anything else there that is no file is refused.
 
     :param fsync: False: do not wait for the disk.  A power failure may then cost the file.
@@ -156,7 +156,7 @@ def make_folder(folder: Path) -> None:
 
 class Attempts:
     """
-    Files that are written one after the other, where one that fails does not prevent the next.
+    Files that are written one after the other; a failure does not prevent the next file.
 
     :param folder: where they belong.
     """
@@ -168,7 +168,7 @@ class Attempts:
 
     @contextmanager
     def attempt(self, name: str) -> Iterator[None]:
-        """Write one file in this block; its error is kept, and not raised."""
+        """Write one file in this block; its error is recorded, not raised."""
         try:
             yield
         except (DloCalibrationError, OSError) as error:
@@ -193,7 +193,7 @@ class Attempts:
         """
         Do nothing if all files were written.
 
-        :raises DloCalibrationError: if not; it names those that were not written, and those that were.
+        :raises DloCalibrationError: if not; it names the files that failed and those that were written.
         """
         if self._failed:
             there = f'; {", ".join(self.written)} could be' if self.written else ''
@@ -202,7 +202,7 @@ class Attempts:
 
 
 def reason(error: Exception) -> str:
-    """Return why something could not be written, without names that a user need not know."""
+    """Return why something could not be written, without its path."""
     if isinstance(error, OSError):
         return error.strerror or str(error)
     return error.came if isinstance(error, InputError) else ' '.join(str(error).split()) or repr(error)

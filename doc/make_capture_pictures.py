@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Make the pictures of capture.md: the capture page, as somebody uses it on the sample photographs.
+Make the pictures of capture.md: the capture page in use with the sample photographs.
 
     python doc/make_capture_pictures.py [FOLDER]
 
@@ -26,17 +26,17 @@ HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent / 'test' / 'support'))
 
 from browser import browser, Tab  # noqa: E402
-from capture_page import apart, Page  # noqa: E402
+from capture_page import page_process  # noqa: E402
 
 SAMPLE = HERE.parent / 'msg_samples/photographs'
 CLICKS = json.loads((HERE.parent / 'test/capture/sample_clicks.json').read_text(encoding='utf-8'))
 TRUTH = json.loads((SAMPLE / 'truth.json').read_text(encoding='utf-8'))
-STICKERS = ((846, 809), (1478, 234))  # px, where the hand let go in second.jpg and third.jpg
-COLOURS, MOST = 128, 120  # of a picture, and px that count of each; the table's grain takes the most room
-DRAWN = 1.5  # s until everything is drawn
+STICKERS = ((846, 809), (1478, 234))  # px, where the hand opened in second.jpg and third.jpg
+COLOURS, MOST = 128, 120  # of a picture, and px of each that count; the table's grain takes the most room
+DRAWN = 1.5  # s, for drawing everything
 
 
-def kept(folder: Path, name: str, png: bytes) -> None:
+def save(folder: Path, name: str, png: bytes) -> None:
     """Write a screenshot as a small PNG."""
     picture = Image.open(io.BytesIO(png)).convert('RGB')
     rounded = np.minimum((np.asarray(picture).astype(int) + 4) // 8 * 8, 255)
@@ -52,18 +52,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = sys.argv[1:] if arguments is None else arguments
     folder = Path(given[0]) if given else HERE
     with tempfile.TemporaryDirectory() as project, browser() as chromium, \
-            apart(Path(project) / 'rope') as (server, _):
+            page_process(Path(project) / 'rope', program=('-m', 'dlo_calibration')) as (server, _):
         tab = Tab(chromium, server.address, color_scheme='light', reduced_motion='reduce')
-        tell(tab, server, folder)
+        take_pictures(tab, folder)
         tab.close()
     return 0
 
 
-def tell(tab: Tab, server: Page, folder: Path) -> None:
+def take_pictures(tab: Tab, folder: Path) -> None:
     """Go through the steps of the page, and take a picture of each."""
     def picture(name: str) -> None:
         time.sleep(DRAWN)
-        kept(folder, name, tab.page.screenshot())
+        save(folder, name, tab.page.screenshot())
 
     tab.find('input[type=file]').first.set_input_files([SAMPLE / name for name in CLICKS])
     tab.find('.photographs li').nth(2).wait_for()
@@ -103,7 +103,7 @@ def tell(tab: Tab, server: Page, folder: Path) -> None:
     tab.find('.line.simulated').first.wait_for()
     show(tab, 2, 'Goal')
     picture('capture_result')
-    kept(folder, 'capture', tab.find('#pictures').screenshot())
+    save(folder, 'capture', tab.find('#pictures').screenshot())
 
 
 def show(tab: Tab, trial: int, role: str) -> None:

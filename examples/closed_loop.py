@@ -51,11 +51,11 @@ def arc(length, height, turn, middle):
 class SimulatedRobot:
     """A rope on a table, a tracker that publishes where it is, and hands that do what an action says."""
 
-    def __init__(self, node, found, pace):
+    def __init__(self, node, description, pace):
         self.node, self.pace = node, pace
-        posterior, options = Posterior.of(found), found.file_options.options()
+        posterior, options = Posterior.of(description), description.file_options.options()
         height = options.table_height + posterior.best['self_collision']
-        self.start = Chain(arc(found.length, height, 0.0, (0.3, 0.0)))
+        self.start = Chain(arc(description.length, height, 0.0, (0.3, 0.0)))
         self.physical = posterior.lying(self.start, options).draws(1, seed=2)[0]
         self.pool = Pool(make_simulator(replace(options, nodes=NODES // 2 + 1)).refined())
         self.steps, self.points = [], self.start.points
@@ -71,18 +71,18 @@ class SimulatedRobot:
 
     def execute(self, message):
         """Do what an action says, `pace` times as fast as it says; each hand grips the nearest point."""
-        times = [Duration.from_msg(one.time_from_start).nanoseconds / 1e9 for one in message.points]
+        times = [Duration.from_msg(point.time_from_start).nanoseconds / 1e9 for point in message.points]
         hands = []
         for k, name in enumerate(message.joint_names):
-            places = [one.transforms[k].translation for one in message.points]
-            path = np.array([(one.x, one.y, one.z) for one in places])
+            places = [point.transforms[k].translation for point in message.points]
+            path = np.array([(place.x, place.y, place.z) for place in places])
             grip = int(np.linalg.norm(self.points - path[0], axis=1).argmin())
             hands.append(Hand(name, (grip,), np.array(times), path))
         self.steps.append(ActionStep(Action(tuple(hands))))
         # From the very start each time, as a chain alone does not tell how much the rope is stretched.
-        found, = rehearse(self.pool, [
+        rehearsal, = rehearse(self.pool, [
             RehearsalJob(self.start, tuple(self.steps), self.physical, trajectories=True)])
-        course = (*found.trajectories[-1], found.chains[-1])
+        course = (*rehearsal.trajectories[-1], rehearsal.chains[-1])
         for self.points in course:
             self.rest(times[-1] / self.pace / len(course))
 
@@ -118,17 +118,17 @@ def main():
 
     log.info('waiting for the planner, and for a description of the rope')
     wait(lambda: {'dlo_description', 'status'} <= heard.keys() and client.service_is_ready()
-         and goals.get_subscription_count() and all(one.get_publisher_count() for one in listening))
-    found = read_description(heard['dlo_description'].data)
-    robot = SimulatedRobot(node, found, pace)
-    goal = arc(found.length, robot.points[0, 2], 2.0, (0.35, 0.12))
+         and goals.get_subscription_count() and all(topic.get_publisher_count() for topic in listening))
+    description = read_description(heard['dlo_description'].data)
+    robot = SimulatedRobot(node, description, pace)
+    goal = arc(description.length, robot.points[0, 2], 2.0, (0.35, 0.12))
     goals.publish(chain(goal[::SEEN], node.get_clock().now()))
 
-    def told(points):
+    def distance(points):
         error = np.linalg.norm(points - goal[::SEEN], axis=1).mean()
-        return f'{1e3 * error:.1f} mm ({100 * error / found.length:.1f} % of its length) from the goal'
+        return f'{1e3 * error:.1f} mm ({100 * error / description.length:.1f} % of its length) from the goal'
 
-    log.info(f'the rope is {told(robot.points[::SEEN])}')
+    log.info(f'the rope is {distance(robot.points[::SEEN])}')
     for number in range(1, MOST_ACTIONS + 1):
         wait(lambda: not status('missing'))
         robot.rest(0.5)  # so that the planner gets a chain at rest
@@ -144,9 +144,9 @@ def main():
         wait(lambda: 'action' in heard)
         steps = json.loads(heard['steps'].data)['actions']
         log.info(f'action {number}: {steps[0]["name"]}, the first of {len(steps)} planned in '
-                 f'{float(status("seconds")):.1f} s; predicted: {told(np.array(steps[0]["predicted"]))}')
+                 f'{float(status("seconds")):.1f} s; predicted: {distance(np.array(steps[0]["predicted"]))}')
         robot.execute(heard['action'])
-        log.info(f'action {number}: done; the rope is {told(robot.points[::SEEN])}')
+        log.info(f'action {number}: done; the rope is {distance(robot.points[::SEEN])}')
     log.info(f'the planner says: {status("detail")}')
     rclpy.shutdown()
 

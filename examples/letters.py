@@ -37,7 +37,7 @@ from dlo_calibration import calibrate, Chain, Options, plan, PlanOptions, read_s
 from dlo_calibration.calibration.engines import make_simulator  # noqa: E402
 from dlo_calibration.calibration.result import CalibrationResult  # noqa: E402
 from dlo_calibration.evaluation import Pool  # noqa: E402
-from dlo_calibration.files.session import samples, session_trials  # noqa: E402
+from dlo_calibration.files.session import samples  # noqa: E402
 from dlo_calibration.model.action import Action  # noqa: E402
 from dlo_calibration.model.chain import Floats  # noqa: E402
 from dlo_calibration.model.parameters import GRAVITY  # noqa: E402
@@ -102,7 +102,7 @@ def stroke(corners: Sequence[Place], length: float) -> Floats:
     return points - (points.min(axis=0) + points.max(axis=0)) / 2
 
 
-def held(letter: Floats, found: CalibratedDlo) -> Floats:
+def held(letter: Floats, rope: CalibratedDlo) -> Floats:
     """
     Return the shape nearest to a letter, (NODES, 2) [m], in which the rope stays when it is let go.
 
@@ -114,7 +114,7 @@ def held(letter: Floats, found: CalibratedDlo) -> Floats:
 
     :param letter: (NODES, 2) [m].
     """
-    physical, length = Posterior.of(found).best, found.length
+    physical, length = Posterior.of(rope).best, rope.length
     most = SAFETY * physical['friction'] * physical['mass'] * GRAVITY / length / physical['flexibility']
     step = length / (NODES - 1)
     slope = most * np.tril(np.full((NODES, NODES), step))  # d(kappa)/ds, then kappa, then headings
@@ -126,17 +126,17 @@ def held(letter: Floats, found: CalibratedDlo) -> Floats:
         """Return the unknowns within their bounds that fit best, with free ends, given kappa^3 [1/m^3]."""
         middle = np.append(-cubes / (2 * most), 0.0)
         half = np.append(np.ones(NODES), 30.0)
-        found: Floats = lsq_linear(np.concatenate([rows, ends]), [*wanted, 0, 0],
-                                   (middle - half, middle + half), method='bvls').x
-        return found
+        unknowns: Floats = lsq_linear(np.concatenate([rows, ends]), [*wanted, 0, 0],
+                                      (middle - half, middle + half), method='bvls').x
+        return unknowns
 
     unknowns = fitted(headings, np.unwrap(np.arctan2(*np.diff(letter, axis=0).T[::-1])), np.zeros(NODES))
     for _ in range(STEPS):
         angles = headings @ unknowns
         segments = step * np.stack([np.cos(angles), np.sin(angles)], axis=1)
         turning = np.stack([-segments[:, 1], segments[:, 0]], axis=1)[:, :, None] * headings[:, None]
-        points, moved = (np.concatenate([np.zeros_like(one[:1]), np.cumsum(one, axis=0)])
-                         for one in (segments, turning))
+        points, moved = (np.concatenate([np.zeros_like(steps[:1]), np.cumsum(steps, axis=0)])
+                         for steps in (segments, turning))
         points, moved = points - (points - letter).mean(axis=0), moved - moved.mean(axis=0)
         unknowns = fitted(moved.reshape(2 * NODES, -1) / length,
                           (letter - points + moved @ unknowns).ravel() / length,
@@ -147,16 +147,15 @@ def held(letter: Floats, found: CalibratedDlo) -> Floats:
 def calibrated(dlo: KnownDlo) -> CalibrationResult:
     """Calibrate a rope from its session."""
     session = read_session(samples() / dlo.name)
-    options = Options.of(session.recorded or {})
-    return calibrate(session_trials(session, options)[0], options)
+    return calibrate(session.trials, session.options)
 
 
 def laid(letter: str) -> Laid:
     """Lay a rope into a letter."""
     name, corners = LETTERS[letter]
-    dlo = next(one for one in KNOWN_DLOS if one.name == name)
-    found = calibrated(dlo)
-    shape = Chain(np.column_stack([held(stroke(corners, dlo.length), found), np.full(NODES, dlo.radius)]))
+    dlo = next(dlo for dlo in KNOWN_DLOS if dlo.name == name)
+    rope = calibrated(dlo)
+    shape = Chain(np.column_stack([held(stroke(corners, dlo.length), rope), np.full(NODES, dlo.radius)]))
     goal = shape.resample(np.linspace(0, shape.length, POINTS))
     start = np.full((POINTS, 3), dlo.radius)
     start[:, 0] = goal[0, 0]
@@ -167,7 +166,7 @@ def laid(letter: str) -> Laid:
         reality, chains, actions = Reality(dlo, Chain(start), simulator), [start], []
         for k in range(MOST_ACTIONS):
             camera = Chain(seen(reality.points) + random.normal(0, NOISE, (len(seen(start)), 3)))
-            steps = plan(found, camera, Chain(seen(goal)), options)
+            steps = plan(rope, camera, Chain(seen(goal)), options)
             if not steps.actions:
                 break
             reality.act(steps.actions[0].action)
@@ -178,7 +177,7 @@ def laid(letter: str) -> Laid:
             sys.stdout.flush()
         job = RehearsalJob(Chain(start), reality.steps, dlo.physical, trajectories=True)
         laid, = rehearse(Pool(simulator), [job])
-    return Laid(letter, dlo, goal, np.stack(chains), tuple(error(one, goal, dlo) for one in chains),
+    return Laid(letter, dlo, goal, np.stack(chains), tuple(error(points, goal, dlo) for points in chains),
                 tuple(actions), laid.trajectories)
 
 
@@ -191,9 +190,9 @@ def main() -> int:
     """Lay and draw the letters."""
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else os.curdir)
     folder.mkdir(parents=True, exist_ok=True)
-    found = [laid(letter) for letter in LETTERS]
-    draw_letters(found, folder / 'letters.png')
-    draw_film(found, folder / 'letters.gif')
+    letters = [laid(letter) for letter in LETTERS]
+    draw_letters(letters, folder / 'letters.png')
+    draw_film(letters, folder / 'letters.gif')
     return 0
 
 

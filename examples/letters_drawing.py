@@ -79,21 +79,21 @@ class Rope:
         return end + half * (np.cos(angles) * across + np.sin(angles) * along)
 
 
-def draw_letters(found: Sequence[Laid], path: Path) -> None:
+def draw_letters(letters: Sequence[Laid], path: Path) -> None:
     """Write the PNG: the letters, and below each the steps that led to it."""
     with settings():
         figure = blank_figure(11, 7.3, layout=None)
         figure.set_facecolor(TABLE)
         axes = figure.add_axes((0.01, 0.385, 0.98, 0.605))
-        lefts, width, height = _places([one.chains[-1] for one in found])
-        for one, colour, left in zip(found, COLOURS, lefts, strict=True):
-            shape = one.chains[-1][:, :2]
-            rope = Rope(axes, colour, one.dlo.radius, one.dlo.length)
+        lefts, width, height = _places([laid.chains[-1] for laid in letters])
+        for laid, colour, left in zip(letters, COLOURS, lefts, strict=True):
+            shape = laid.chains[-1][:, :2]
+            rope = Rope(axes, colour, laid.dlo.radius, laid.dlo.length)
             rope.show(shape + [left - shape[:, 0].min(), -shape[:, 1].min()])
-            axes.text(left + np.ptp(shape[:, 0]) / 2, -0.022, _caption(one), color=INK, fontsize=10,
+            axes.text(left + np.ptp(shape[:, 0]) / 2, -0.022, _caption(laid), color=INK, fontsize=10,
                       ha='center', va='top', linespacing=1.5)
         _bare(axes, (-0.05, width + 0.05), (-0.062, height + 0.012))
-        _draw_steps(figure, found)
+        _draw_steps(figure, letters)
         figure.text(0.5, 0.022, 'Each step: the rope before (grey), the way of the hand, the rope after, and '
                     'its mean distance from the goal (dotted) in percent of the length.', color=INK,
                     fontsize=8.5, ha='center')
@@ -102,25 +102,25 @@ def draw_letters(found: Sequence[Laid], path: Path) -> None:
     _fewer_colours(path)
 
 
-def _draw_steps(figure: Any, found: Sequence[Laid]) -> None:
+def _draw_steps(figure: Any, letters: Sequence[Laid]) -> None:
     """Draw the steps of all letters in one row, to the same scale."""
-    count = sum(len(one.chains) for one in found)
+    count = sum(len(laid.chains) for laid in letters)
     gap, left = 0.03, 0.02
-    each = (1 - 2 * left - gap * (len(found) - 1)) / count
-    extents = [_extent(one) for one in found]
+    each = (1 - 2 * left - gap * (len(letters) - 1)) / count
+    extents = [_extent(laid) for laid in letters]
     half = np.max([(high - low) / 2 for low, high in extents], axis=0)
-    for one, colour, (low, high) in zip(found, COLOURS, extents, strict=True):
+    for laid, colour, (low, high) in zip(letters, COLOURS, extents, strict=True):
         middle = (low + high) / 2
-        for k, chain in enumerate(one.chains):
+        for k, chain in enumerate(laid.chains):
             axes = figure.add_axes((left, 0.13, each, 0.235))
-            axes.plot(*one.goal[:, :2].T, linestyle=(0, (1, 1.6)), color=INK, linewidth=0.8, alpha=0.6)
+            axes.plot(*laid.goal[:, :2].T, linestyle=(0, (1, 1.6)), color=INK, linewidth=0.8, alpha=0.6)
             if k:
-                axes.plot(*one.chains[k - 1][:, :2].T, color=PALE, linewidth=2.2, solid_capstyle='round')
+                axes.plot(*laid.chains[k - 1][:, :2].T, color=PALE, linewidth=2.2, solid_capstyle='round')
             axes.plot(*chain[:, :2].T, color=colour, linewidth=2.4, solid_capstyle='round')
             if k:
-                _draw_way(axes, one.actions[k - 1])
+                _draw_way(axes, laid.actions[k - 1])
             _bare(axes, *np.transpose([middle - half, middle + half]))
-            figure.text(left + each / 2, 0.112, f'{k or "start"}\n{one.errors[k]:.2g} %', color=INK,
+            figure.text(left + each / 2, 0.112, f'{k or "start"}\n{laid.errors[k]:.2g} %', color=INK,
                         fontsize=8.5, ha='center', va='top', linespacing=1.35)
             left += each
         left += gap
@@ -135,27 +135,27 @@ def _draw_way(axes: Any, action: Any) -> None:
             'shrinkA': 0, 'shrinkB': 0})
 
 
-def draw_film(found: Sequence[Laid], path: Path) -> None:
+def draw_film(letters: Sequence[Laid], path: Path) -> None:
     """Write the GIF: all ropes at the same time, about three times as fast as in reality."""
     with settings():
         figure = blank_figure(7.6, 5.4, layout=None)
         figure.set_facecolor(TABLE)
         axes = figure.add_axes((0.01, 0.01, 0.98, 0.93))
-        lefts, width, _ = _places([np.concatenate([one.chains[0], one.chains[-1]]) for one in found])
+        lefts, width, _ = _places([np.concatenate([laid.chains[0], laid.chains[-1]]) for laid in letters])
         ropes, offsets, hands = [], [], []
-        for one, colour, left in zip(found, COLOURS, lefts, strict=True):
-            both = np.concatenate([one.chains[0], one.chains[-1]])
-            offsets.append(np.array([left - both[:, 0].min(), -one.chains[-1][:, 1].min()]))
-            ropes.append(Rope(axes, colour, 1.3 * one.dlo.radius, one.dlo.length, twisted=False))
+        for laid, colour, left in zip(letters, COLOURS, lefts, strict=True):
+            both = np.concatenate([laid.chains[0], laid.chains[-1]])
+            offsets.append(np.array([left - both[:, 0].min(), -laid.chains[-1][:, 1].min()]))
+            ropes.append(Rope(axes, colour, 1.3 * laid.dlo.radius, laid.dlo.length, twisted=False))
             hands += axes.plot([], [], 'o', color=HAND, markersize=7, zorder=9)
         everything = np.concatenate([
-            chains.reshape(-1, 3)[:, :2] + offset for one, offset in zip(found, offsets, strict=True)
-            for chains in (one.chains, *one.courses)])
+            chains.reshape(-1, 3)[:, :2] + offset for laid, offset in zip(letters, offsets, strict=True)
+            for chains in (laid.chains, *laid.courses)])
         _bare(axes, *np.transpose([everything.min(axis=0) - 0.03, everything.max(axis=0) + 0.03]))
         title = figure.text(0.5, 0.955, '', color=INK, ha='center', fontsize=12)
         writer = PillowWriter(fps=RATE)
         with whole(path) as new, writer.saving(figure, str(new), dpi=SHOWN):
-            for text, chains, places in _frames(found):
+            for text, chains, places in _frames(letters):
                 title.set_text(text)
                 for k, offset in enumerate(offsets):
                     ropes[k].show(chains[k][:, :2] + offset)
@@ -163,38 +163,38 @@ def draw_film(found: Sequence[Laid], path: Path) -> None:
                 writer.grab_frame()
 
 
-def _frames(found: Sequence[Laid]) -> Any:
+def _frames(letters: Sequence[Laid]) -> Any:
     """Yield a title, the chains of all ropes, and where the hands are; nan: the hand is open."""
-    nowhere = [np.full(3, np.nan)] * len(found)
+    nowhere = [np.full(3, np.nan)] * len(letters)
     for _ in range(STILL):
-        yield 'three calibrated ropes', [one.chains[0] for one in found], nowhere
-    most = max(len(one.actions) for one in found)
+        yield 'three calibrated ropes', [laid.chains[0] for laid in letters], nowhere
+    most = max(len(laid.actions) for laid in letters)
     for k in range(most):
-        acting = [k < len(one.actions) for one in found]
-        last = max(len(one.courses[k]) for one, acts in zip(found, acting, strict=True) if acts)
+        acting = [k < len(laid.actions) for laid in letters]
+        last = max(len(laid.courses[k]) for laid, acts in zip(letters, acting, strict=True) if acts)
         for m in range(0, last, EVERY):
             chains, places = [], []
-            for one, acts in zip(found, acting, strict=True):
-                moving = acts and m < len(one.courses[k])
-                chains.append(one.courses[k][m] if moving else one.chains[min(k + acts, len(one.actions))])
-                hand = one.actions[k].hands[0] if moving else None
+            for laid, acts in zip(letters, acting, strict=True):
+                moving = acts and m < len(laid.courses[k])
+                chains.append(laid.courses[k][m] if moving else laid.chains[min(k + acts, len(laid.actions))])
+                hand = laid.actions[k].hands[0] if moving else None
                 places.append(np.full(3, np.nan) if hand is None else hand.positions_at(
-                    hand.start + (m + 1) / (len(one.courses[k]) + 1) * (hand.end - hand.start))[0])
+                    hand.start + (m + 1) / (len(laid.courses[k]) + 1) * (hand.end - hand.start))[0])
             yield f'action {k + 1}', chains, places
         for _ in range(STILL // 2 if k < most - 1 else 3 * STILL):
             yield f'action {k + 1}' if k < most - 1 else 'D L O', [
-                one.chains[min(k + 1, len(one.actions))] for one in found], nowhere
+                laid.chains[min(k + 1, len(laid.actions))] for laid in letters], nowhere
 
 
 def _places(shapes: Sequence[Floats]) -> tuple[list[float], float, float]:
     """Return where each shape begins when they stand side by side, and the width and height of all [m]."""
-    widths = [float(np.ptp(one[:, 0])) for one in shapes]
+    widths = [float(np.ptp(points[:, 0])) for points in shapes]
     lefts = [sum(widths[:k]) + BETWEEN * k for k in range(len(widths))]
-    return lefts, lefts[-1] + widths[-1], max(float(np.ptp(one[:, 1])) for one in shapes)
+    return lefts, lefts[-1] + widths[-1], max(float(np.ptp(points[:, 1])) for points in shapes)
 
 
-def _extent(one: Laid) -> tuple[Floats, Floats]:
-    everything = np.concatenate([one.chains.reshape(-1, 3), *(hand.positions for action in one.actions
+def _extent(laid: Laid) -> tuple[Floats, Floats]:
+    everything = np.concatenate([laid.chains.reshape(-1, 3), *(hand.positions for action in laid.actions
                                                               for hand in action.hands)])[:, :2]
     return everything.min(axis=0) - 0.015, everything.max(axis=0) + 0.015
 
@@ -205,10 +205,10 @@ def _bare(axes: Any, x: Sequence[float], y: Sequence[float]) -> None:
     axes.axis('off')
 
 
-def _caption(one: Laid) -> str:
-    dlo = one.dlo
+def _caption(laid: Laid) -> str:
+    dlo = laid.dlo
     return (f'{100 * dlo.length:.0f} cm, {1e3 * dlo.mass:.0f} g, {2e3 * dlo.radius:.0f} mm thick\n'
-            f'after {len(one.actions)} actions {10 * one.errors[-1] * dlo.length:.1f} mm from the goal')
+            f'after {len(laid.actions)} actions {10 * laid.errors[-1] * dlo.length:.1f} mm from the goal')
 
 
 def _fewer_colours(path: Path) -> None:

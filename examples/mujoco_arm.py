@@ -72,10 +72,10 @@ WORLD = f"""
 """
 
 
-def with_rope(found, chain):
+def with_rope(description, chain):
     """Return the world of the arm with a calibrated rope at a chain."""
     world = mujoco.MjSpec.from_string(WORLD)
-    rope = mujoco.MjSpec.from_string(export_mjcf(found, chain, options=Options(nodes=31)))
+    rope = mujoco.MjSpec.from_string(export_mjcf(description, chain, options=Options(nodes=31)))
     # The options of a world hold for all that is attached to it.
     for name in ('timestep', 'integrator', 'cone', 'impratio', 'viscosity'):
         setattr(world.option, name, getattr(rope.option, name))
@@ -89,10 +89,10 @@ def with_rope(found, chain):
 def angles_at(point):
     """Return the angles of the first four joints at which the gripper, pointing down, is at a point [m]."""
     reach, height = np.hypot(*point[:2]), point[2] + HAND - SHOULDER
-    apart = np.hypot(reach, height)
-    inside = np.arccos((UPPER**2 + apart**2 - FORE**2) / (2 * UPPER * apart))
+    distance = np.hypot(reach, height)
+    inside = np.arccos((UPPER**2 + distance**2 - FORE**2) / (2 * UPPER * distance))
     shoulder = np.arctan2(height, reach) + inside
-    elbow = -np.arccos((apart**2 - UPPER**2 - FORE**2) / (2 * UPPER * FORE))
+    elbow = -np.arccos((distance**2 - UPPER**2 - FORE**2) / (2 * UPPER * FORE))
     return [np.arctan2(point[1], point[0]), shoulder, elbow, -np.pi / 2 - shoulder - elbow]
 
 
@@ -105,9 +105,9 @@ class Scene:
     """
 
     def __init__(self, description, pace):
-        found = read_result(description)
-        points = np.linspace((0.5, -0.25, 0.0), (0.5, -0.25 + found.chain.length, 0.0), 41)
-        self.model = with_rope(found, Chain(points + (0, 0, found.physical()['self_collision'])))
+        result = read_result(description)
+        points = np.linspace((0.5, -0.25, 0.0), (0.5, -0.25 + result.chain.length, 0.0), 41)
+        self.model = with_rope(result, Chain(points + (0, 0, result.physical()['self_collision'])))
         self.state, self.pace = mujoco.MjData(self.model), pace
         mujoco.mj_resetDataKeyframe(self.model, self.state, self.model.key(f'{ROPE}start').id)
         self.position, self.fingers = np.array([0.45, -0.15, 0.3]), OPEN
@@ -117,7 +117,7 @@ class Scene:
         mujoco.mj_forward(self.model, self.state)
         self.slides = [self.model.jnt_qposadr[k] for k in range(self.model.njnt)
                        if self.model.joint(k).name.startswith(f'{ROPE}dlo_stretch')]
-        self.length = found.chain.length  # m
+        self.length = result.chain.length  # m
         self.stretch, self.height = 0.0, 0.0  # the largest until now: of the whole rope; of the point [m]
 
     @property

@@ -54,9 +54,9 @@ class World:
         self.angles = {**dict.fromkeys(self.movable, 0.0), **dict(enumerate(AT_FIRST)), **OPEN}
         for joint, angle in self.angles.items():
             pybullet.resetJointState(self.arm, joint, angle, physicsClientId=client)
-        found = read_result(description)
-        points = np.linspace((0.55, -0.25, 0.0), (0.55, -0.25 + found.chain.length, 0.0), 41)
-        physical = found.physical()
+        result = read_result(description)
+        points = np.linspace((0.55, -0.25, 0.0), (0.55, -0.25 + result.chain.length, 0.0), 41)
+        physical = result.physical()
         self.rope = BulletRope.of(client, Chain(points + (0, 0, physical['self_collision'])), physical)
         self.lengths = np.linalg.norm(np.diff(self.rope.points, axis=0), axis=1)  # m, of its segments
         self.stretch, self.height = 0.0, 0.0  # the largest until now, of any segment; of any point [m]

@@ -82,7 +82,7 @@ def action(hands, stamp):
 
 def values(message, name):
     """Return the key-value pairs of one status of a DiagnosticArray."""
-    return {pair.key: pair.value for one in message.status if one.name == name for pair in one.values}
+    return {pair.key: pair.value for part in message.status if part.name == name for pair in part.values}
 
 
 def main():
@@ -107,7 +107,7 @@ def main():
 
     log.info('waiting for the calibrator')
     wait(lambda: 'status' in heard and start.service_is_ready() and all(
-        one.get_subscription_count() for one in (initial, hands, goal)))
+        publisher.get_subscription_count() for publisher in (initial, hands, goal)))
     for number in range(len(PLAYED)):
         before = status('trials'), status('last_refusal')
         initial.publish(chain(observed(number, moved=False), node.get_clock().now()))
@@ -123,8 +123,8 @@ def main():
     log.info(answer.result().message)
     if answer.result().success:
         wait(lambda: 'result' in heard or 'status' in heard and status('state') == 'failed')
-        for one in heard['result'].status if 'result' in heard else heard['status'].status:
-            log.info(f'{one.name}: {one.message}')
+        for entry in heard['result'].status if 'result' in heard else heard['status'].status:
+            log.info(f'{entry.name}: {entry.message}')
         if 'result' in heard:
             log.info(values(heard['result'], 'calibration')['findings'])
     rclpy.shutdown()

@@ -22,7 +22,7 @@ import numpy as np
 
 from dlo_calibration import calibrate
 from dlo_calibration.calibration.engines import make_simulator
-from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.options import FileOptions, Options
 from dlo_calibration.files.request import GoalRequest, Request, TrialRequest, write_request
 from dlo_calibration.files.result import write_result
 from dlo_calibration.files.session import read_session, session_trials
@@ -64,7 +64,7 @@ def measured() -> Request:
         TrialRequest(action.name, initial, (action,), tuple(
             GoalRequest(rounded(goal.chain.points), goal.time) for goal in trial.goals))
         for trial, initial, action in zip(trials, initials, named_actions(initials), strict=True)),
-        FIT, 'object1')
+        FileOptions(FIT), 'object1')
 
 
 def simulated(draft: TrialRequest) -> TrialRequest:
@@ -102,8 +102,8 @@ def push_and_release() -> Request:
         (TwoHands(fractions=(0.0, 0.75), motion='together', distance=0.2, height=0.2),
          TwoHands(fractions=(0.0, 0.75), motion='apart', distance=0.15, start=5.0)),
         (GoalRequest(initial, 4.0), GoalRequest(initial, 8.0)))
-    return Request((simulated(held), simulated(apart)), {**FIT, 'calibrate': ['flexibility', 'friction']},
-                   'a simulated cable')
+    options = FileOptions({**FIT, 'calibrate': ['flexibility', 'friction']})
+    return Request((simulated(held), simulated(apart)), options, 'a simulated cable')
 
 
 def hand_paths() -> Request:
@@ -117,7 +117,7 @@ def hand_paths() -> Request:
     goals = [GoalRequest(initial, time, stable=False) for time in times]
     return Request((simulated(TrialRequest(
         'clamp', initial, (Action((clamp,)),),
-        (*goals, GoalRequest(initial, 4.0, held_by=('gripper',))))),), FIT)
+        (*goals, GoalRequest(initial, 4.0, held_by=('gripper',))))),), FileOptions(FIT))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -23,23 +23,23 @@ def findings(*arguments):
 
 
 def test_ruff_finds_nothing():
-    found = findings('ruff', 'check', '--output-format', 'concise')
-    assert not found, found
+    errors = findings('ruff', 'check', '--output-format', 'concise')
+    assert not errors, errors
 
 
 @pytest.mark.long  # make lint and continuous integration execute it
 @pytest.mark.skipif(np.lib.NumpyVersion(np.__version__) < '2.0.0', reason='types of numpy 1 are less exact')
 def test_mypy_finds_nothing():
-    found = findings('mypy')
-    assert not found, found
+    errors = findings('mypy')
+    assert not errors, errors
 
 
 @pytest.mark.long
 def test_benchmarks_and_examples_use_only_what_the_package_has():
     """They run for too long to be tests; without this, they break when something they use moves."""
     scripts = [str(path) for pattern in ('benchmark/*.py', 'examples/*.py') for path in ROOT.glob(pattern)]
-    found = findings('mypy', '--config-file=', '--check-untyped-defs', '--ignore-missing-imports',
+    errors = findings('mypy', '--config-file=', '--check-untyped-defs', '--ignore-missing-imports',
                      '--follow-imports=silent', '--hide-error-context', *scripts)
-    wrong = [line for line in found.splitlines()
+    wrong = [line for line in errors.splitlines()
              if line.endswith(('[attr-defined]', '[call-arg]', '[name-defined]', '[syntax]'))]
     assert not wrong, '\n'.join(wrong)

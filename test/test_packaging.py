@@ -85,8 +85,8 @@ def test_what_is_imported_is_declared():
     not_in_manifest = {name for name in names - OPTIONAL
                        if ROSDEP_KEYS.get(name, f'python3-{name}') not in keys
                        and FROM_PIP.get(name) not in from_pip()}
-    not_in_setup = {name for name in names if not any(f"'{one}>=" in requirements
-                                                      for one in distributions.get(name, [name]))}
+    not_in_setup = {name for name in names if not any(f"'{distribution}>=" in requirements
+                                                      for distribution in distributions.get(name, [name]))}
     assert names
     assert not_in_manifest == set(), 'add them to package.xml or requirements.txt'
     assert not_in_setup == set(), 'add them to setup.py'
@@ -132,8 +132,8 @@ def test_the_changelog_can_be_released():
     label = package_version.get_forthcoming_label(text)
     title = f'{setup_value("version")} (2030-01-01)'
     released = text.replace(f'{label}\n{"-" * len(label)}', f'{title}\n{"-" * len(title)}')
-    found = changelog.populate_changelog_from_rst(changelog.Changelog(NAME), released)
-    (version, _, entries), = found.foreach_version()
+    parsed = changelog.populate_changelog_from_rst(changelog.Changelog(NAME), released)
+    (version, _, entries), = parsed.foreach_version()
     assert version == setup_value('version')
     assert sum(str(entry).count('* ') for entry in entries) >= text.count('\n* ')
 
@@ -196,9 +196,8 @@ def test_a_wheel_from_a_source_distribution_has_all_that_is_used(sources, buildi
     names = wheel.namelist()
     entry_points = wheel.read(next(name for name in names if name.endswith('entry_points.txt'))).decode()
     assert all(f'{name} = ' in entry_points for name in EXECUTABLES)
-    assert {f'{NAME}/py.typed', f'{NAME}/simulation/core/_core.pyi'} <= set(names)
-    assert f'{NAME}/search/__init__.py' in names
-    assert {str(file.relative_to(ROOT)) for kind in ('xsd', 'html')
+    assert {f'{NAME}/py.typed', f'{NAME}/search/__init__.py'} <= set(names)
+    assert {str(file.relative_to(ROOT)) for kind in ('html', 'pyi', 'xsd')
             for file in (ROOT / NAME).rglob(f'*.{kind}')} <= set(names)
     assert any(name.endswith(f'share/{NAME}/package.xml') for name in names)
     assert not any(name.startswith('test') for name in names)

@@ -17,7 +17,7 @@ PATIENCE = 60.0  # s
 
 #: The command line, in which something else takes the place of the verbs.
 PROGRAM = """
-import sys, time, types
+import sqlite3, sys, time, types
 from pathlib import Path
 from dlo_calibration import __main__ as program
 sys.modules['dlo_calibration.cli.main'] = verbs = types.ModuleType('verbs')
@@ -32,24 +32,30 @@ def load():
             (Path(sys.argv[1]) / '.begun').touch()
             time.sleep(600)  # an exception here would be shown, and ignored
     Library()
-verbs.main = {'write': write, 'load': load}[sys.argv[2]]
+def compute():
+    (Path(sys.argv[1]) / '.begun').touch()  # one call of C for half an hour
+    sqlite3.connect(':memory:').execute("SELECT instr(zeroblob(20000000), zeroblob(10000000) || x'01')")
+verbs.main = {'write': write, 'load': load, 'compute': compute}[sys.argv[2]]
 sys.exit(program.main())
 """
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize('work', ['write', 'load'])
+@pytest.mark.parametrize('work', ['write', 'load', 'compute'])
 def test_a_signal_ends_it_with_one_line_and_no_unfinished_file(tmp_path, number, work):
     process = subprocess.Popen([sys.executable, '-c', PROGRAM, tmp_path, work], stdout=subprocess.PIPE,
                                stderr=subprocess.PIPE, text=True,
                                env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)})
-    begun = time.monotonic()
-    while not list(tmp_path.iterdir()):
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() - begun < PATIENCE
-        time.sleep(0.01)
-    process.send_signal(number)
-    output, errors = process.communicate(timeout=PATIENCE)
+    try:
+        begun = time.monotonic()
+        while not list(tmp_path.iterdir()):
+            assert process.poll() is None, process.communicate()
+            assert time.monotonic() - begun < PATIENCE
+            time.sleep(0.01)
+        process.send_signal(number)
+        output, errors = process.communicate(timeout=PATIENCE)
+    finally:
+        process.kill()
     assert (process.returncode, output, errors) == (128 + number, '', 'dlo-calibration: interrupted\n')
     assert [path.name for path in tmp_path.iterdir()] == ([] if work == 'write' else ['.begun'])
 

@@ -16,7 +16,7 @@ from dlo_calibration.calibration.engines import engine_digest, SimulatorFactory
 from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.calibration.fit import Fit, fit
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.calibration.prior import Prior, prior
+from dlo_calibration.calibration.prior import Prior
 from dlo_calibration.calibration.refinement import refine
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.calibration.setting import Setting
@@ -26,6 +26,7 @@ from dlo_calibration.calibration.stages import (
     examined,
     second_engine,
     with_missing_parameters,
+    with_outlier,
 )
 from dlo_calibration.errors import InputError
 from dlo_calibration.evaluation.cluster import ClusterExecutor
@@ -33,7 +34,7 @@ from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.evaluation.log import EvaluationLog, Memory
 from dlo_calibration.evaluation.pool import Threads
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.observation.plausibility import implausible_trials
+from dlo_calibration.observation.plausibility import implausible_trials, observation_warnings
 from dlo_calibration.search import SEARCHES
 
 
@@ -67,30 +68,34 @@ def calibrate(trials: Sequence[Trial], options: Options | None = None, *,
         raise InputError('calibration', 'no trials', 'at least one complete trial',
                          'record an initial chain, an action and a goal chain first')
     begun, options = clock(), options or Options()
-    notices: list[str] = []
+    warnings: list[str] = []
 
-    def notice(text: str) -> None:
-        notices.append(text)
+    def warn(text: str) -> None:
+        warnings.append(text)
         on_notice(text)
 
     with ExitStack() as stack:
         simulator = stack.enter_context(closing(make_simulator(options)))
-        second = stack.enter_context(second_engine(options, make_simulator, simulator.name))
+        second = stack.enter_context(second_engine(
+            options, make_simulator, simulator.name, len(trials)))
         executor = stack.enter_context(closing(
-            ClusterExecutor(options.scheduler, notice, on_notice) if options.scheduler else
+            ClusterExecutor(options.scheduler, warn, on_notice) if options.scheduler else
             Threads(options.workers)))
         memory = Memory(log, engine_digest(options) if log is not None else '', on_notice)
         setting = Setting(tuple(trials), options, simulator, executor, should_stop, on_evaluation, memory)
         stack.callback(setting.pool.stop)
         result = fitted(setting)
+        result = with_outlier(setting, result)
         confirm = stack.enter_context(confirming(result, second, should_stop, memory))
         result = advised(setting, result)
         result = with_missing_parameters(setting, result)
         result = confirm(result)
     implausible = implausible_trials(trials, options.table_top, bool(options.scene))
-    noticed = (text if count == 1 else f'{text} ({count} times)' for text, count in Counter(notices).items())
+    observed = () if implausible else observation_warnings(trials, options.table_top, options.mass)
+    counted = (text if count == 1 else f'{text} ({count} times)' for text, count in Counter(warnings).items())
     return replace(result, choice=setting.choice, implausible=implausible, seconds=clock() - begun,
-                   warnings=(*implausible, *result.warnings, *noticed))
+                   warnings=(*implausible, *observed, *setting.hand_warnings,
+                             *filter(None, [result.outlier_words]), *result.warnings, *counted))
 
 
 def fitted(setting: Setting) -> CalibrationResult:
@@ -99,22 +104,22 @@ def fitted(setting: Setting) -> CalibrationResult:
 
     :raises SimulationError: if no evaluation could be simulated.
     """
-    known = prior(setting.trials, setting.options)
-    best_fit = searched(setting, known)
+    prior = Prior.of(setting.trials, setting.options, setting.evidence)
+    best_fit = searched(setting, prior)
     best_fit = examined(setting, best_fit)
     best_fit = replace(best_fit, best=setting.judged(best_fit.space, best_fit.best))
-    return CalibrationResult.of(setting, known, best_fit)
+    return CalibrationResult.of(setting, prior, best_fit)
 
 
-def searched(setting: Setting, known: Prior) -> Fit:
+def searched(setting: Setting, prior: Prior) -> Fit:
     """
     Find the best parameter set with the chosen search, and the number of parts if that is open.
 
     :raises SimulationError: if no evaluation could be simulated.
     """
     options = setting.options
-    search = SEARCHES[options.search](known.space.dimension, options.seed, known.hints)
+    search = SEARCHES[options.search](prior.space.dimension, options.seed, prior.hints)
     if not setting.chooses_parts:
-        return fit(setting, known.space, search, options.evaluations)
-    uniform = fit(setting, known.space, search, min(options.evaluations, budget(known.space.dimension)))
+        return fit(setting, prior.space, search, options.evaluations)
+    uniform = fit(setting, prior.space, search, min(options.evaluations, budget(prior.space.dimension)))
     return refine(setting, uniform, options.evaluations)

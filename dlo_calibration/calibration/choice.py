@@ -12,6 +12,7 @@ from dlo_calibration.calibration.options import AUTO, Options
 from dlo_calibration.model.parameters import PAPER_PARAMETERS
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.excitation import motions
+from dlo_calibration.observation.grips import GripEvidence
 from dlo_calibration.search import LeastSquares
 
 #: What `calibrate` auto adds to the paper's parameters.
@@ -21,7 +22,7 @@ BETWEEN_CLAMPS = ('torsion', 'bending_friction', 'bending_slip')
 DECIDED = ('calibrate', 'evaluations')  # names of the options that may be open
 
 PAPER_ROUNDS = 150  # evaluations; enough for the paper's four parameters
-LINEARISATIONS = 15  # in the budget of a search; a Gauss-Newton descent takes about 10
+LINEARISATIONS = 15  # in the budget of a search; a Gauss-Newton descent needs about 10
 REFINEMENT = 400  # evaluations, beside those of one search, to choose rest shape and parts
 
 
@@ -31,26 +32,36 @@ class Choice:
     The options of a calibration, all of them decided.
 
     :param words: which parameters `calibrate` auto has chosen, and why; empty if the user named them.
+    :param corrected: names of the options of the hands that auto has set to what the chains show.
     """
 
     options: Options
     words: str = ''
+    corrected: tuple[str, ...] = ()
 
 
-def choose(trials: Sequence[Trial], options: Options) -> Choice:
+def choose(trials: Sequence[Trial], options: Options, evidence: GripEvidence | None = None) -> Choice:
     """
     Decide the options that are open, from the trials: `calibrate` auto, and `evaluations` 0.
 
     The same trials and options give the same choice. Options that leave nothing open do not change.
+
+    :param evidence: what the trials show of the hands, if it is known already.
     """
-    words = ''
+    words, errors = '', dict[str, float]()
     if options.calibrate == (AUTO,):
         names, words = _parameters(trials)
         options = replace(options, calibrate=names)
+        # Chains show the errors of hands better than a simulation, whose grips are at its nodes.
+        evidence = evidence or GripEvidence.of(trials)
+        errors = {name: evidence.errors[name] for name in _unset(evidence, options)}
+        if errors:
+            options = Options.of({**options.flat(), **errors})
+            words += f' Corrected: {", ".join(errors)}, because {evidence.words(errors)}.'
     if options.evaluations == 0:
         rounds = budget(options.space.dimension) + REFINEMENT * chooses_parts(trials, options)
         options = replace(options, evaluations=rounds)
-    return Choice(options, words)
+    return Choice(options, words, tuple(errors))
 
 
 def chooses_parts(trials: Sequence[Trial], options: Options) -> bool:
@@ -65,7 +76,7 @@ def budget(dimension: int) -> int:
 
 
 def _parameters(trials: Sequence[Trial]) -> tuple[tuple[str, ...], str]:
-    """Return the parameters that the trials excite, and a sentence that says why."""
+    """Return the parameters that the trials show, and a sentence that says why."""
     moving, between_clamps = motions(trials)
     names: tuple[str, ...] = PAPER_PARAMETERS
     words = f'Calibrated: {", ".join(PAPER_PARAMETERS)}'
@@ -77,3 +88,34 @@ def _parameters(trials: Sequence[Trial]) -> tuple[tuple[str, ...], str]:
     if names == PAPER_PARAMETERS:
         words += f'; not {", ".join(IN_MOTION)}, because no goal was seen in motion'
     return names, f'{words}.'
+
+
+def hand_error(evidence: GripEvidence, options: Options) -> str:
+    """Return an error of the hands that is not corrected, with a remedy; '' if there is none."""
+    left = [name for name in _unset(evidence, options) if not _is_calibrated(name, options)]
+    return f'{evidence.words(left)}; add {" and ".join(left)} to calibrate' \
+        if left else ''
+
+
+def hand_warnings(evidence: GripEvidence, options: Options, corrected: Sequence[str] = ()
+                  ) -> tuple[str, ...]:
+    """
+    Return warnings about errors of the stamps and places of the hands.
+
+    :param corrected: names of the options of the hands that a choice has set.
+    """
+    automatic = options.calibrate == (AUTO,)
+    corrected = _unset(evidence, options) if automatic else corrected
+    calibrated = [] if automatic else [name for name in evidence.errors if name in options.calibrate]
+    words = [f'{evidence.words(names)}: {remedy} as {", ".join(names)}'
+             for names, remedy in ((corrected, 'corrected'), (calibrated, 'calibrated')) if names]
+    return (*words, *filter(None, [hand_error(evidence, options)]))
+
+
+def _unset(evidence: GripEvidence, options: Options) -> list[str]:
+    """Return the errors of the hands whose values the user has not given."""
+    return [name for name in evidence.errors if not getattr(options, name)]
+
+
+def _is_calibrated(name: str, options: Options) -> bool:
+    return options.calibrate == (AUTO,) or name in options.calibrate

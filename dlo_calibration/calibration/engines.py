@@ -8,14 +8,14 @@ from __future__ import annotations
 import functools
 from importlib.util import find_spec
 import logging
-from typing import Any, Callable, Mapping, Sequence
+from typing import Any, Callable, Mapping
 
 from dlo_calibration.calibration.options import AUTO, Options
 from dlo_calibration.errors import InputError, printable
 from dlo_calibration.evaluation.digest import code_digest, digest
-from dlo_calibration.evaluation.process_simulator import ProcessSimulator
+from dlo_calibration.evaluation.process_simulator import bullet_simulator, ProcessSimulator
 from dlo_calibration.simulation.protocol import Simulator
-from dlo_calibration.simulation.scene import Obstacle, read_scene
+from dlo_calibration.simulation.scene import read_scene
 
 #: Rooms whose code determines an evaluation: with another version of them, it may differ.
 DECISIVE = ('model', 'observation', 'simulation', 'evaluation')
@@ -33,14 +33,8 @@ def _bullet(options: Options) -> Simulator:
         raise NoPyBullet(content if options.scene else 'engine bullet', 'no PyBullet',
                          'that library', 'install it: pip install pybullet')
     obstacles = read_scene(options.scene) if options.scene else ()
-    return ProcessSimulator('bullet', functools.partial(_bullet_here, engine_settings(options), obstacles),
-                            content, options.answer_limit)
-
-
-def _bullet_here(settings: Mapping[str, Any], obstacles: Sequence[Obstacle]) -> Simulator:
-    from dlo_calibration.simulation.bullet import BulletSimulator
-
-    return BulletSimulator(obstacles=obstacles, **settings)
+    make = functools.partial(bullet_simulator, engine_settings(options), obstacles)
+    return ProcessSimulator('bullet', make, content, options.answer_limit)
 
 
 def _compiled(options: Options) -> Simulator:

@@ -84,7 +84,10 @@ def fit(setting: Setting, space: ParameterSpace, search: Search, budget: int, fi
         raise SimulationError('stopped before the first evaluation had finished')
     if not best.scores:
         raise SimulationError(f'none of {len(evaluations)} evaluations could be simulated: {best.failure}')
-    ended = search.stop_reason or f'budget of {first + budget} evaluations spent'
+    spent, most = first + budget, setting.options.evaluations
+    ended = search.stop_reason or (
+        f'budget of {most} evaluations spent' if spent >= most else
+        f'{spent} of at most {most} evaluations made, as many as this search may take')
     return Fit(space, search.name, best, tuple(evaluations), ended, stopped, model=search.model)
 
 

@@ -21,6 +21,7 @@ from typing import Any, Mapping, NoReturn, Self, Sequence
 from dlo_calibration.errors import InputError, one_of, suggestion
 from dlo_calibration.model.parameters import (
     BY_NAME,
+    HANDS,
     measured,
     MOST_PARTS,
     PAPER_PARAMETERS,
@@ -89,6 +90,15 @@ class Declaration:
                              f' {self.unit}'.rstrip(), 'choose a value in that range')
         return value
 
+    def read(self, text: str) -> Any:
+        """Return the value that a text gives, unchecked; the text itself if it gives none."""
+        kind = type(self.default)
+        try:
+            return {'true': True, 'false': False}[text] if kind is bool else \
+                tuple(text.split()) if kind is tuple else kind(text)
+        except (KeyError, ValueError):
+            return text
+
 
 def declared(default: Any, description: str, of: str, **rest: Any) -> Any:
     """Return a dataclass field that declares an option; its arguments are those of `Declaration`."""
@@ -121,10 +131,10 @@ class DeclaredOptions:
 
         :raises InputError: for an unknown name, a wrong type, or a value out of range.
         """
-        known = [option.name for option in cls.declarations()]
+        names = [option.name for option in cls.declarations()]
         for name in options:
-            if name not in known:
-                refuse_name(name, known)
+            if name not in names:
+                refuse_name(name, names)
         return cls._built(options)
 
     @classmethod
@@ -147,10 +157,10 @@ class DeclaredOptions:
         """
 
 
-def refuse_name(name: str, known: Sequence[str]) -> NoReturn:
+def refuse_name(name: str, names: Sequence[str]) -> NoReturn:
     """Raise the InputError for an option with an unknown name."""
-    raise InputError('parameter', repr(name), f'{one_of(known, name)} in doc/messages.md',
-                     suggestion(name, known, 'correct the name'))
+    raise InputError('parameter', repr(name), f'{one_of(names, name)} in doc/messages.md',
+                     suggestion(name, names, 'correct the name'))
 
 
 #: The options that a simulation needs.
@@ -158,6 +168,12 @@ SIMULATION = ('table', 'table_height', 'scene', 'engine', 'nodes', 'time_step', 
               'stable_time', 'settle_limit', 'answer_limit')
 AUTO = 'auto'  # calibrate: see `choice`; engine: the fastest one that supports the options, see CONFIRMING
 CONFIRMING = 'bullet'  # the engine that checks the result of `auto`
+
+
+def _hand_shift(axis: str) -> Any:
+    parameter = BY_NAME[f'hand_shift_{axis}']
+    return declared(0.0, f'{parameter.description}; used if it is not calibrated', unit='m',
+                    minimum=parameter.at_zero, maximum=parameter.at_hundred, of=OBSERVATION)
 
 
 @dataclass(frozen=True)
@@ -185,6 +201,13 @@ class Options(DeclaredOptions):
         '', 'path of a URDF file with fixed obstacles that the DLO can touch, in addition to the table; '
         'relative to the working directory; a session or document can name only a file in its own folder; '
         'empty: no obstacles', of=OBSERVATION)
+    hand_delay: float = declared(
+        0.0, 'by how much the stamps of actions are late, negative: early; used if it is not calibrated',
+        unit='s', minimum=BY_NAME['hand_delay'].at_zero, maximum=BY_NAME['hand_delay'].at_hundred,
+        of=OBSERVATION)
+    hand_shift_x: float = _hand_shift('x')
+    hand_shift_y: float = _hand_shift('y')
+    hand_shift_z: float = _hand_shift('z')
     calibrate: tuple[str, ...] = declared(
         (AUTO,), "names of the parameters to find; all others keep their fixed value; auto: the paper's four "
         '(flexibility, elasticity, friction, self_collision), and what the trials show besides: damping and '
@@ -310,7 +333,8 @@ class Options(DeclaredOptions):
         named = ParameterSpace(self._names)
         bent = {name: value for name, value in self.values.items()
                 if name in REST_SHAPE and value != BY_NAME[name].default}
-        return ParameterSpace(self._names, self.values, self.mass).divided(
+        hands = {name: BY_NAME[name].value(getattr(self, name)) for name in HANDS if getattr(self, name)}
+        return ParameterSpace(self._names, {**self.values, **hands}, self.mass).divided(
             max(self.parts, named.parts)).shaped(named.knots or ParameterSpace(self._names, bent).knots)
 
     @property
@@ -324,7 +348,7 @@ FIXED_VALUES: Mapping[str, Declaration] = {
         f'{measured(p.at_hundred, p.unit)} (at 100), {"linear" if p.linear else "logarithmic"}; '
         'used if it is not calibrated',
         of=SEARCH, minimum=0.0, maximum=SCALE)
-    for p in PARAMETERS if p.name != 'mass'}  # the mass is an option in kg
+    for p in PARAMETERS if p.name not in ('mass', *HANDS)}  # these are options in kg, s and m
 
 
 def names_of(kind: str) -> tuple[str, ...]:
@@ -338,12 +362,12 @@ class FileOptions:
     Options of a file, by name.
 
     :param values: those to use, without the machine's; `scene` is an absolute path.
-    :param problems: warnings about what is left out.
+    :param warnings: what the user should know about the file, e.g. which options are left out.
     :param refusal: why the scene is left out; without its scene, nothing can be simulated.
     """
 
     values: Mapping[str, Any] = field(default_factory=dict)
-    problems: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     refusal: InputError | None = None
 
     def __post_init__(self) -> None:
@@ -368,26 +392,26 @@ def file_options(given: Mapping[str, Any], folder: Path | None) -> FileOptions:
     :param folder: of the file; None: the options came in a message or as bytes.
     """
     usable: dict[str, Any] = {}
-    problems = []
+    warnings = []
     for name, value in given.items():
         try:
             Options.of({name: value})
         except InputError as error:
-            problems.append(f'a recorded option is left out: {error}')
+            warnings.append(f'a recorded option is left out: {error}')
         else:
             usable[name] = value
     defaults = Options().flat()
     ignored = [name for name in names_of(MACHINE) if usable.pop(name, defaults[name]) != defaults[name]]
     if ignored:
-        problems.append(f'recorded options are left out, as only the command line or the node may set them: '
+        warnings.append(f'recorded options are left out, as only the command line or the node may set them: '
                         f'{", ".join(ignored)}')
     try:
         if usable.get('scene'):
             usable['scene'] = str(_scene(usable['scene'], folder))
     except InputError as error:
         del usable['scene']
-        return FileOptions(usable, (*problems, str(error)), error)
-    return FileOptions(usable, tuple(problems))
+        return FileOptions(usable, (*warnings, str(error)), error)
+    return FileOptions(usable, tuple(warnings))
 
 
 def recordable(options: Mapping[str, Any]) -> dict[str, Any]:

@@ -12,14 +12,15 @@ import numpy as np
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.model.parameters import BY_NAME, ParameterSpace, SCALE
+from dlo_calibration.model.parameters import BY_NAME, HANDS, ParameterSpace, SCALE
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.estimate import start_point
 from dlo_calibration.observation.excitation import excites
+from dlo_calibration.observation.grips import GripEvidence
 from dlo_calibration.search import Hints
 
 #: Physical values of a cable in SI units. Half of the start points of a search take them and differ only in
-#: stiffness: from random points, a search of so many parameters rarely finds the friction between strands,
+#: stiffness: from random points, a search among many parameters rarely finds the friction between strands,
 #: because strong damping explains the trials nearly as well.
 CABLE = {'elasticity': 100.0, 'damping': 0.3, 'internal_damping': 0.004, 'torsion': 2 / 3,
          'bending_friction': 1.0, 'bending_slip': 0.5}
@@ -33,7 +34,7 @@ class Prior:
     """
     What is known before the first simulation.
 
-    :param space: the parameters to find; an estimate replaces the default of those in `guessed`.
+    :param space: the parameters to find; those in `guessed` have an estimate as their default.
     :param hints: for the search.
     :param guessed: names of the parameters whose default was replaced.
     """
@@ -42,25 +43,34 @@ class Prior:
     hints: Hints
     guessed: tuple[str, ...] = ()
 
+    @classmethod
+    def of(cls, trials: Sequence[Trial], options: Options, evidence: GripEvidence | None = None) -> Prior:
+        """
+        Return the prior of the parameters to find, from the observed chains alone.
 
-def prior(trials: Sequence[Trial], options: Options) -> Prior:
-    """Return the prior of the parameters to find, from the observed chains alone."""
-    space, height = options.space, options.table_top
-    shown = np.logical_or.reduce(excites(trials, space, height))
-    hints = Hints(_with_cable(space, start_point(trials, space, height)), shown)
-    default = BY_NAME[GUESSED].default
-    if GUESSED not in space.free or space.fixed.get(GUESSED, default) != default:
-        return Prior(space, hints)
-    start = float(hints.start[space.free.index(GUESSED)])
-    if not 0 <= start <= 1:
-        return Prior(space, hints)
-    return Prior(replace(space, fixed={**space.fixed, GUESSED: start * SCALE}), hints, (GUESSED,))
+        :param evidence: what the trials show of the hands, if it is known already.
+        """
+        evidence = evidence or GripEvidence.of(trials)
+        space, height = options.space, options.table_top
+        shown = np.logical_or.reduce(excites(trials, space, height))
+        start = _with_cable(space, start_point(trials, space, height))
+        for name, value in evidence.estimates.items():
+            if name in space.free:
+                start[space.free.index(name)] = BY_NAME[name].value(value) / SCALE
+        hints = Hints(start, shown & [name not in HANDS or name in evidence.estimates for name in space.free])
+        default = BY_NAME[GUESSED].default
+        if GUESSED not in space.free or space.fixed.get(GUESSED, default) != default:
+            return cls(space, hints)
+        radius = float(hints.start[space.free.index(GUESSED)])
+        if not 0 <= radius <= 1:
+            return cls(space, hints)
+        return cls(replace(space, fixed={**space.fixed, GUESSED: radius * SCALE}), hints, (GUESSED,))
 
 
 def _with_cable(space: ParameterSpace, start: Floats) -> Floats:
     """Return the (d,) prior estimate, with values of a cable if friction between strands is calibrated."""
     if 'bending_friction' not in space.free:
-        return start
+        return start.copy()
     cable = np.array([BY_NAME[name].value(CABLE[name]) / SCALE if name in CABLE else np.nan
                       for name in space.free])
-    return np.where(np.isnan(start), cable, start)
+    return np.asarray(np.where(np.isnan(start), cable, start))

@@ -4,8 +4,8 @@
 """
 Refinement: how many knots of the rest shape and parts of different stiffness the trials support.
 
-A finer DLO contains the coarser one, so that each search begins at the result of the one before, and
-with its Jacobian, to which only the columns of new parameters are added.
+A finer DLO contains the coarser one. So each search starts at the result of the previous search and reuses
+its Jacobian; only the columns of new parameters are added.
 """
 
 from __future__ import annotations
@@ -82,9 +82,9 @@ def refine(setting: Setting, uniform: Fit, budget: int) -> Fit:
 
 class _Ladder:
     """
-    Tries ever finer spaces, and keeps the one that predicts left-out trials best.
+    Tries ever finer spaces, and keeps the best predictor of left-out trials.
 
-    :param best: so far; like every fit that is tried, with its linear model.
+    :ivar best: the best fit so far; every fit that is tried has its linear model.
     """
 
     def __init__(self, setting: Setting, best: Fit, budget: int) -> None:
@@ -93,17 +93,17 @@ class _Ladder:
         self._setting, self._budget = setting, budget
         self._layout = ResidualLayout.compared(setting.trials)
         self._tried = [best]
-        self._simulated = 0  # beside the searches
+        self._simulated = 0  # parameter sets, beside those of the searches
 
     @property
-    def _taken(self) -> int:
+    def _spent(self) -> int:
         return sum(len(tried.evaluations) for tried in self._tried)
 
     def climb(self, rungs: Iterable[tuple[int, Finer]]) -> str:
         """
-        Try rungs, each from the one before, until two of them are not better than the best.
+        Try rungs, each from the previous one, until two of them are no improvement.
 
-        The first of them may mislead: two parts do not show that a DLO is stiff in the middle, four do.
+        A single one may mislead: two parts do not show that a DLO is stiff in the middle, four do.
 
         :param rungs: the number of knots or parts of each, and how to refine a space.
         :returns: why it ended, in words; empty if there is no finer rung.
@@ -113,11 +113,11 @@ class _Ladder:
             if _explained(self._setting.trials, self.best):
                 break
             space, start = finer(latest.space, latest.best.point)
-            if self._budget - self._taken < 2 * space.dimension:
+            if self._budget - self._spent < 2 * space.dimension:
                 return f': the rest of the budget is too small to try {count}'
             try:
                 stage = self._fitted(space, start, finer, latest)
-                errors = None if stage is None else self._left_out(stage)
+                errors = None if stage is None else self._fold_errors(stage)
             except CancelledError:
                 return f': stopped before {count} were fitted'
             except SimulationError:  # the fit of the coarser space remains valid
@@ -125,7 +125,7 @@ class _Ladder:
             latest = stage or latest
             if stage is not None and errors is not None:
                 if self._best_errors is None:
-                    self._best_errors = self._left_out(self.best)
+                    self._best_errors = self._fold_errors(self.best)
                 if predicts_better(errors, self._best_errors):
                     self.best, self._best_errors, why = stage, errors, ''
                     continue
@@ -166,15 +166,15 @@ class _Ladder:
         if here.predicted(here.step(WIDEST)) > (1 - LEAST_SHARE) * here.loss.cost(before):
             return None
         search = LeastSquares(space.dimension, 0, Hints.at(start, jacobian, coarse=True))
-        taken = self._taken
+        spent = self._spent
         finest = fit(self._setting, space, search,
-                     min(self._budget - taken, MOST_COARSE * space.dimension), first=taken)
+                     min(self._budget - spent, MOST_COARSE * space.dimension), first=spent)
         self._tried.append(finest)
         if finest.stopped:
             raise CancelledError
         return None if finest.model is None else finest
 
-    def _left_out(self, fit: Fit) -> Floats:
+    def _fold_errors(self, fit: Fit) -> Floats:
         """Return the (f,) mean point error [m] of each fold of the cross-validation."""
         evaluate = self._setting.evaluate(fit.space)
         assert fit.model is not None
@@ -216,7 +216,7 @@ def _with_parts(count: int, space: ParameterSpace, point: Floats) -> tuple[Param
 
 
 def _shows_rest_shape(trials: Sequence[Trial], space: ParameterSpace) -> bool:
-    """Tell whether the trials can show a rest shape: two clamps hold the DLO and its frame in each start."""
+    """Tell whether the trials can show a rest shape: in each, two clamps hold the DLO from the start."""
     torsion = 'torsion' in space.free or space.fixed.get('torsion', 0.0) > 0
     return torsion and 'natural_curvature' not in space.free and all(
         len(clamps(trial)) > 1 for trial in trials)

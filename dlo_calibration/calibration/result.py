@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 import math
 from typing import Any, Mapping, Sequence
@@ -20,20 +20,25 @@ from dlo_calibration.evaluation.evaluation import Evaluation, mean_length
 from dlo_calibration.evaluation.residuals import at_every_goal, ResidualLayout
 from dlo_calibration.inference.advice import Advice
 from dlo_calibration.inference.examination import Confirmation, DISTANCE_TOLERANCE, Examination
-from dlo_calibration.inference.missing_parameters import MissingParameter
+from dlo_calibration.inference.missing_parameters import MissingParameter, PARTS
+from dlo_calibration.inference.outlier import Outlier
 from dlo_calibration.inference.uncertainty import (
+    DEVIATIONS,
     IDENTIFIABLE,
     INVOLVED,
     NOT_IDENTIFIABLE,
     predictive_std,
     spread_of_best,
     Uncertainty,
+    verdict,
 )
-from dlo_calibration.model.chain import Floats, frozen_array, put_back
+from dlo_calibration.model.chain import Floats, frozen_array, interpolate_unseen
 from dlo_calibration.model.parameters import BY_NAME, measured, number, ParameterSpace, SCALE
-from dlo_calibration.model.score import observed, PointErrors
+from dlo_calibration.model.score import distances, MEAN_DISTANCE, observed, PointErrors
 from dlo_calibration.model.trial import Trial
+from dlo_calibration.observation.noise import NO_NOISE, noise
 
+NOT_USABLE = 'the result is not usable'  # note of its parameters
 WORST = 0.1  # of the length; good models of real DLOs miss the measured points by 0.3 to 3 % of it
 
 
@@ -69,17 +74,22 @@ class CalibrationResult:
     """
     The result of a calibration.
 
+    :param estimates: what the trials tell of each parameter; see `parameters`.
     :param chains: (g, n, 3) simulated chains at the goals of each trial [m].
     :param examination: around the best evaluation; None if the user stopped before.
     :param advice: which action to observe next; None if none would help, or it was not computed.
     :param missing_parameters: fixed parameters that would explain part of the residuals; empty if noise
         explains the residuals, or if it was not computed.
     :param choice: the decided options; None: nothing was calibrated.
+    :param hand_error: of stamps or places of the hands that was not corrected; '' if there is none.
+    :param outlier: a trial that does not fit the others.
+    :param unusable_fit: why the calibration that found the parameters is unusable, where they only are
+        validated here.
     :param implausible: why the trials cannot be as described, see `plausibility`; `warnings` has it, too.
     """
 
     space: ParameterSpace
-    parameters: Mapping[str, ParameterEstimate]
+    estimates: Mapping[str, ParameterEstimate]
     best: Evaluation
     trials: tuple[Trial, ...]
     chains: tuple[Floats, ...]
@@ -96,6 +106,9 @@ class CalibrationResult:
     missing_parameters: tuple[MissingParameter, ...] = ()
     choice: Choice | None = None
     implausible: tuple[str, ...] = ()
+    hand_error: str = ''
+    outlier: Outlier | None = None
+    unusable_fit: str = ''
 
     @classmethod
     def of(cls, setting: Setting, prior: Prior, fit: Fit) -> CalibrationResult:
@@ -107,47 +120,117 @@ class CalibrationResult:
                 examination.uncertainty.excited)
         return cls(
             space=fit.space, best=best, trials=trials,
-            parameters=parameter_estimates(fit.space, best, uncertainty, prior.guessed),
+            estimates={**parameter_estimates(fit.space, best, uncertainty, prior.guessed),
+                       **hand_estimates(setting)},
             chains=simulated_chains(trials, best), evaluations=fit.evaluations, seconds=0.0,
             search=fit.search, engine=setting.simulator.name, stop_reason=fit.stop_reason,
-            seed=setting.options.seed, warnings=_warnings(best, fit.evaluations), examination=examination)
+            seed=setting.options.seed, warnings=_warnings(best, fit.evaluations), examination=examination,
+            hand_error=setting.hand_error)
 
     @property
     def unusable(self) -> str:
         """
         Why the parameters should not be used, in one sentence; '' if they can be.
 
-        The first of these reasons counts: a trial is implausible; the fit is far worse than models of DLOs
-        are; two engines differ by more than the fit misses the measurement; the search ended before a
-        minimum; the fit is not better than the default parameters, though noise does not explain it; the
-        trials determine no parameter.
+        The first of these reasons counts: a trial is implausible; stamps or places of the hands are wrong;
+        the fit is far worse than models of DLOs are; a trial that does not fit the others decides a value;
+        two engines differ by more than the fit misses the measurement; the search ended before a minimum;
+        the fit is not better than the default parameters, though noise does not explain it; the trials
+        determine no parameter.
         """
         mean, examination, other = self.errors.mean, self.examination, self.confirmation
         if self.implausible:
             return self.implausible[0]
+        if self.hand_error:
+            return self.hand_error
         if mean > WORST * self.length:
-            return (f'the simulated points are {measured(mean, "m")} from the measured ones on average, '
-                    f'{number(100 * mean / self.length)} % of the length: check frames, grips and clocks')
+            return (f'the mean error is {number(100 * mean / self.length)} % of the length; check frames, '
+                    'grips and clocks')
         if self.choice is None:
-            return ''  # nothing was fitted
+            return self.unusable_fit
+        if self.outlier is not None and self.outlier.decided:
+            return self.outlier_words
         if other is not None and other.mean_distance > max(mean, DISTANCE_TOLERANCE):
             return (f'engine {other.engine} differs from {self.engine} by '
                     f'{measured(other.mean_distance, "m")}, '
-                    'more than the fit from the measurement: check the trials on which they disagree')
+                    'more than the fit from the measurement; check the trials on which they disagree')
         if examination is None or not examination.regular:
-            return (f'the search has not reached a minimum ({self.stop_reason}): calibrate with more '
+            return (f'the search has not reached a minimum ({self.stop_reason}); calibrate with more '
                     'evaluations or another search')
         if mean >= examination.default_error and not examination.noise_alone:
             return (f'the default parameters fit as well ({measured(examination.default_error, "m")} on '
-                    'average), and noise does not explain what is left: check frames, grips and clocks')
-        if all(estimate.verdict == NOT_IDENTIFIABLE for estimate in self.parameters.values()):
-            return 'these trials determine none of the parameters: observe an action that shows one'
+                    'average), and noise does not explain what is left; check frames, grips and clocks')
+        if all(self.estimates[name].verdict == NOT_IDENTIFIABLE for name in self.space.free):
+            remedy = 'observe an action that shows one' if self.advice is None else \
+                f'next, {self.advice.words}'
+            return f'these trials determine none of the parameters; {remedy}'
         return ''
+
+    @property
+    def headline(self) -> str:
+        """The first line to read: whether the result is usable, its mean error, and what to do next."""
+        mean, from_noise = self.errors.mean, MEAN_DISTANCE * self.noise_level
+        error = f'the simulated points are {measured(mean, "m")} from the measured ones'
+        if from_noise > NO_NOISE:
+            error += f', {number(float(f"{mean / from_noise:.2g}"))} times the noise'
+        if self.unusable:
+            return f'Not usable: {self.unusable.removesuffix(".")}. {error[0].upper()}{error[1:]}.'
+        return f'Usable: {error}. {self._next_step}'.strip()
+
+    @property
+    def _next_step(self) -> str:
+        """What a user of a usable result should do next; '' where nothing was fitted."""
+        if self.choice is None:
+            return ''
+        if self.outlier is not None:
+            return f'Next: repeat {self.outlier.trial}, which does not fit the others.'
+        if self.advice is not None:
+            return f'Next: {self.advice.words}, to know {self.advice.parameter} better.'
+        unknown = [name for name, estimate in self.estimates.items() if estimate.verdict == NOT_IDENTIFIABLE]
+        if unknown:
+            return f'Next: do not rely on {", ".join(unknown)}, which these trials do not determine.'
+        if self.missing_parameters:
+            name = self.missing_parameters[0].name
+            return 'Next: calibrate with parts 0.' if name == PARTS else f'Next: calibrate {name}, too.'
+        return 'Nothing more is needed.'
+
+    @cached_property
+    def noise_level(self) -> float:
+        """Standard deviation of one measured coordinate [m]; nan if the chains have too few points."""
+        return noise(self.trials) if self.examination is None else self.examination.noise
+
+    @cached_property
+    def parameters(self) -> Mapping[str, ParameterEstimate]:
+        """The calibrated parameters; none of an unusable result is identifiable."""
+        if not self.unusable:
+            return self.estimates
+        return {name: estimate if estimate.verdict == NOT_IDENTIFIABLE else
+                replace(estimate, identifiable=False, verdict=NOT_IDENTIFIABLE, note=NOT_USABLE)
+                for name, estimate in self.estimates.items()}
+
+    @property
+    def outlier_words(self) -> str:
+        """The trial that does not fit the others, and the values without it; '' if there is none."""
+        odd = self.outlier
+        if odd is None:
+            return ''
+        without = ', '.join(f'{name} {number(odd.values[name])} instead of {number(self.values[name])}'
+                            for name in odd.decided) or 'the same values within their intervals'
+        why = 'its goal chains seem to run from the other end of the DLO' if odd.turned else \
+            'a hand may have slipped or let go early'
+        return (f'{odd.trial} does not fit the others: {measured(odd.error, "m")} from what they predict, '
+                f'where they miss {measured(odd.usual, "m")}; without it: {without}; {why}: repeat it, or '
+                f'leave it out (--without {odd.number})')
+
+    @property
+    def trial_errors(self) -> tuple[Floats, ...]:
+        """The point errors [m] of each trial."""
+        return trial_errors(self.trials, self.best)
 
     @property
     def values(self) -> dict[str, float]:
         """Found parameters on the 0..100 scale, by name."""
-        return {name: estimate.value for name, estimate in self.parameters.items()}
+        return {name: estimate.value for name, estimate in self.estimates.items()}
 
     @property
     def correlations(self) -> dict[str, dict[str, float]] | None:
@@ -155,8 +238,10 @@ class CalibrationResult:
         examination, names = self.examination, self.space.free
         if examination is None or not examination.regular or examination.uncertainty.correlations is None:
             return None
-        return {name: dict(zip(names, map(float, row), strict=True))
-                for name, row in zip(names, examination.uncertainty.correlations, strict=True)}
+        rows = zip(names, examination.uncertainty.correlations, strict=True)
+        known = {name: dict(zip(names, map(float, row), strict=True)) for name, row in rows}
+        return {name: {other: known.get(name, {}).get(other, float(name == other))
+                       for other in self.parameters} for name in self.parameters}
 
     @cached_property
     def band(self) -> Floats | None:
@@ -170,7 +255,7 @@ class CalibrationResult:
     @property
     def std(self) -> Floats:
         """(d,) standard deviations of the found values, in the unit cube."""
-        return np.array([estimate.std for estimate in self.parameters.values()]) / SCALE
+        return np.array([self.estimates[name].std for name in self.space.free]) / SCALE
 
     @property
     def errors(self) -> PointErrors:
@@ -222,7 +307,7 @@ def parameter_estimates(space: ParameterSpace, best: Evaluation, uncertainty: Un
             if name in guessed:
                 note = 'no trial shows it; estimated from the height at which the DLO lies'
         low, high = sorted((at_lower, at_upper))
-        verdict = uncertainty.verdicts[k]
+        own_verdict = uncertainty.verdicts[k]
         if uncertainty.excited[k] and (lower <= 0) != (upper >= SCALE):
             words = BY_NAME[name].interval(lower, upper, (low, high), unit)
             note = f'{words}: the interval reaches the end of the scale'
@@ -230,8 +315,23 @@ def parameter_estimates(space: ParameterSpace, best: Evaluation, uncertainty: Un
                 note += ', where the best value is'
         parameters[name] = ParameterEstimate(
             name, value, float(uncertainty.std[k]) * SCALE, lower, upper, at_value, low, high, unit,
-            verdict == IDENTIFIABLE, verdict, note)
+            own_verdict == IDENTIFIABLE, own_verdict, note)
     return parameters
+
+
+def hand_estimates(setting: Setting) -> dict[str, ParameterEstimate]:
+    """Return the errors of the hands that were corrected as the chains show them."""
+    estimates, deviations = {}, setting.evidence.deviations
+    for name in setting.choice.corrected:
+        parameter, at = BY_NAME[name], getattr(setting.options, name)
+        scale = SCALE / (parameter.at_hundred - parameter.at_zero)
+        low, high = (at + side * DEVIATIONS * deviations[name] for side in (-1, 1))
+        value, lower, upper = map(parameter.value, (at, low, high))
+        words = verdict(lower / SCALE, upper / SCALE)
+        estimates[name] = ParameterEstimate(
+            name, value, deviations[name] * scale, lower, upper, at, low, high, parameter.unit,
+            words == IDENTIFIABLE, words, 'as the chains show it, without simulation')
+    return estimates
 
 
 def combination(names: Sequence[str], vector: Floats) -> str:
@@ -247,16 +347,22 @@ def combination(names: Sequence[str], vector: Floats) -> str:
     return words
 
 
+def trial_errors(trials: Sequence[Trial], evaluation: Evaluation) -> tuple[Floats, ...]:
+    """Return the point errors [m] of each trial, from an evaluation of every goal."""
+    assert evaluation.residuals is not None
+    return tuple(distances(evaluation.residuals[rows]) for rows in ResidualLayout.of(trials).rows)
+
+
 def simulated_chains(trials: Sequence[Trial], evaluation: Evaluation) -> tuple[Floats, ...]:
     """Return the simulated chains of each trial, (g, n, 3) [m]: measured chains plus residuals."""
     assert evaluation.residuals is not None
-    apart = ResidualLayout.of(trials).chains(evaluation.residuals)
+    offsets = ResidualLayout.of(trials).chains(evaluation.residuals)
     simulated = []
-    for trial, away in zip(trials, apart, strict=True):
+    for trial, away in zip(trials, offsets, strict=True):
         chains, places = observed(trial) + away, trial.initial.arc_lengths()
         for k, goal in enumerate(trial.goals):
             if not goal.chain.seen.all():  # nothing was compared there
-                chains[k] = put_back(chains[k], goal.chain.seen, places)
+                chains[k] = interpolate_unseen(chains[k], goal.chain.seen, places)
         simulated.append(frozen_array(chains))
     return tuple(simulated)
 
@@ -281,7 +387,7 @@ def plain(result: CalibrationResult) -> dict[str, Any]:
     """
     examination, other, advice = result.examination, result.confirmation, result.advice
     values: dict[str, Any] = with_nulls({
-        'unusable': result.unusable,
+        'headline': result.headline, 'unusable': result.unusable,
         'parameters': {name: {key: value for key, value in asdict(estimate).items() if key != 'name'}
                        for name, estimate in result.parameters.items()},
         **_fit(result.best.score, result.best.scores, result.errors),
@@ -295,10 +401,11 @@ def plain(result: CalibrationResult) -> dict[str, Any]:
         'default_error_m': examination and examination.default_error,
         'noise_m': examination and examination.noise,
         'residual_std_m': examination and examination.uncertainty.residual,
-        'correlations': result.correlations, 'undetermined': result.undetermined,
+        'correlations': result.correlations,
         'advice': advice and {**asdict(advice), **{key: getattr(advice, key) * SCALE for key in (
             'std', 'expected_std', 'lower', 'upper')}},
         'explanations': {missing.name: missing.share for missing in result.missing_parameters},
+        'undetermined': result.undetermined,
         'confirmation': other and {
             'engine': other.engine, **_fit(other.score, other.scores, other.errors),
             'mean_distance_m': other.mean_distance, 'max_distance_m': other.max_distance}})

@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Callable
 
-from dlo_calibration.calibration.choice import Choice, choose, chooses_parts
+from dlo_calibration.calibration.choice import Choice, choose, chooses_parts, hand_error, hand_warnings
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.errors import SimulationError
+from dlo_calibration.errors import InputError, SimulationError
 from dlo_calibration.evaluation.batch import BatchEvaluator
 from dlo_calibration.evaluation.evaluation import Evaluation, Evaluator
 from dlo_calibration.evaluation.log import Memory
@@ -20,6 +20,7 @@ from dlo_calibration.evaluation.pool import Pool
 from dlo_calibration.evaluation.residuals import compared_rows
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Trial
+from dlo_calibration.observation.grips import GripEvidence
 from dlo_calibration.observation.material import with_shared_places
 from dlo_calibration.simulation.protocol import Simulator
 
@@ -29,13 +30,14 @@ class Setting:
     """
     The trials, options, engine and callbacks that all stages of a calibration share.
 
-    :param trials: at least one; those with the same points get the same rest arc lengths.
+    :param trials: at least one; what came after a hand has lost the DLO is left out, and those with the same
+        points get the same rest arc lengths.
     :param options: open ones are decided from the trials, see `choice`.
     :param simulator: the engine.
     :param executor: its workers simulate; None: one thread.
     :param should_stop: polled; once it returns True, every stage ends with what it has so far.
     :param on_evaluation: called with each finished evaluation of the search, in the order asked.
-    :param memory: what was simulated before an interruption; every stage asks it first.
+    :param memory: rollouts and evaluations from before an interruption; every stage asks it first.
     """
 
     trials: tuple[Trial, ...]
@@ -45,12 +47,31 @@ class Setting:
     should_stop: Callable[[], bool] = lambda: False
     on_evaluation: Callable[[Evaluation], None] = lambda _: None
     memory: Memory = field(default_factory=Memory)
+    evidence: GripEvidence = field(init=False)
     choice: Choice = field(init=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, 'choice', choose(self.trials, self.options))
+        evidence = GripEvidence.of(self.trials)
+        trials = evidence.usable(self.trials)
+        if not trials:
+            loss = evidence.losses[0]
+            raise InputError('calibration', f'no trial to use: in {loss.trial}, {loss.words}',
+                             'a trial in which the DLO follows the hands', 'repeat the trials')
+        object.__setattr__(self, 'evidence', evidence)
+        object.__setattr__(self, 'choice', choose(trials, self.options, evidence))
         object.__setattr__(self, 'options', self.choice.options)
-        object.__setattr__(self, 'trials', with_shared_places(self.trials))
+        object.__setattr__(self, 'trials', with_shared_places(trials))
+
+    @property
+    def hand_error(self) -> str:
+        """An error of the hands that is not corrected, with a remedy; '' if there is none."""
+        return hand_error(self.evidence, self.options)
+
+    @property
+    def hand_warnings(self) -> tuple[str, ...]:
+        """Warnings about the hands: those that have lost the DLO, and errors of their stamps and places."""
+        return (*map(str, self.evidence.losses),
+                *hand_warnings(self.evidence, self.options, self.choice.corrected))
 
     @property
     def chooses_parts(self) -> bool:
@@ -86,8 +107,14 @@ class Setting:
 
         :raises SimulationError: if it cannot be simulated again.
         """
-        if compared_rows(self.trials) is None:
-            return evaluation
+        return evaluation if compared_rows(self.trials) is None else self.simulated(space, evaluation)
+
+    def simulated(self, space: ParameterSpace, evaluation: Evaluation) -> Evaluation:
+        """
+        Return the evaluation of the same point on every goal of the setting's trials.
+
+        :raises SimulationError: if it cannot be simulated.
+        """
         evaluator = Evaluator(self.trials, space, self.simulator)
         pool = Pool(self.simulator, self.executor, memory=self.memory)  # also after a stop
         point = evaluation.point

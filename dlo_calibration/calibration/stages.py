@@ -14,29 +14,34 @@ from typing import Callable, Iterator, Sequence
 
 import numpy as np
 
+from dlo_calibration.calibration.choice import budget
 from dlo_calibration.calibration.engines import NoPyBullet, SimulatorFactory
-from dlo_calibration.calibration.fit import Fit
+from dlo_calibration.calibration.fit import Fit, fit
 from dlo_calibration.calibration.options import AUTO, CONFIRMING, Options
-from dlo_calibration.calibration.result import CalibrationResult, simulated_chains
+from dlo_calibration.calibration.result import CalibrationResult, simulated_chains, trial_errors
 from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.errors import one_line, SimulationError
 from dlo_calibration.evaluation.evaluation import Evaluation, Evaluator
 from dlo_calibration.evaluation.linearisation import Linearisation
 from dlo_calibration.evaluation.log import Memory
-from dlo_calibration.evaluation.pool import Pool, Threads
+from dlo_calibration.evaluation.pool import cores, Pool, Threads
 from dlo_calibration.evaluation.process_simulator import ProcessSimulator
 from dlo_calibration.evaluation.residuals import compared_rows, Huber, ResidualLayout
 from dlo_calibration.inference.advice import advise
 from dlo_calibration.inference.examination import Confirmation, disagreements, Examination, examine
 from dlo_calibration.inference.missing_parameters import missing_parameters
+from dlo_calibration.inference.outlier import candidate, is_outlier, Outlier
 from dlo_calibration.inference.slices import simulate_slices, Slices
 from dlo_calibration.inference.uncertainty import Uncertainty
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.model.parameters import REST_SHAPE
+from dlo_calibration.model.parameters import BY_NAME, ParameterSpace, REST_SHAPE
+from dlo_calibration.model.score import observed
 from dlo_calibration.observation.noise import NO_NOISE, noise, with_other_noise
+from dlo_calibration.search import Hints, LeastSquares
 from dlo_calibration.simulation.protocol import Rollout, Simulator
 
-CHAINS = 16  # initial chains with other noise, over all trials
+CHAINS = 32  # initial chains with other noise, over all trials
+MOST_PROCESSES = 2  # that confirm; each takes 50 MB
 STOPPED_PATIENCE = 5.0  # s that a confirmation may take after a request to stop
 
 #: Adds the confirmation by a second engine to a result.
@@ -76,12 +81,14 @@ def _examined(setting: Setting, fit: Fit) -> tuple[Examination, Evaluation]:
         trials, sigma, -(-CHAINS // len(trials)), np.random.default_rng(0)) if noisy else []
     here = best.point[None, :]
     try:
-        # These begin first: they depend on nothing that follows, and occupy threads that would wait.
+        # These begin first: they need no later outcome, and occupy threads that would be idle.
         fine = None if finer is None else setting.evaluate(space, finer=finer).begin(here)
         starts = [setting.evaluate(space, others).begin(here) for others in drawn]
+        hands = [setting.evaluate(_with_hand(space, setting, name)).begin(here)
+                 for name in setting.choice.corrected]
         examination = examine(
             best.point, best.residuals, ResidualLayout.compared(trials), evaluate.residuals,
-            default=default, noise=sigma, finer=fine, starts=starts,
+            default=default, noise=sigma, finer=fine, starts=starts, hands=hands,
             fading=np.array([name not in REST_SHAPE for name in space.free]))
     finally:
         if finer is not None:
@@ -100,12 +107,18 @@ def _examined(setting: Setting, fit: Fit) -> tuple[Examination, Evaluation]:
         examination = replace(examination, evaluations=examination.evaluations + len(points))
         # The cost is half the sum of squares; 10 % exceed a chi-square of 2.71 with one degree of freedom.
         worse = 2 * (loss.cost(again.residuals) - loss.cost(best.residuals)) / uncertainty.scale**2
-        if worse > 2.71 * int((point != best.point).sum()):  # the defaults fit worse: the best values stay
+        if worse > 2.71 * int((point != best.point).sum()):  # the defaults fit worse: keep the best values
             again = best
             uncertainty = replace(uncertainty, excited=uncertainty.excited | (point != best.point))
     assert again.residuals is not None
     remaining = _step(Linearisation(again.point, again.residuals, jacobian), examination.uncertainty)
     return replace(examination, uncertainty=uncertainty.at(best.point, again.point, remaining)), again
+
+
+def _with_hand(space: ParameterSpace, setting: Setting, name: str) -> ParameterSpace:
+    """Return the space in which an error of the hands is larger by its standard deviation."""
+    other = getattr(setting.options, name) + setting.evidence.deviations[name]
+    return replace(space, fixed={**space.fixed, name: BY_NAME[name].value(other)})
 
 
 def _step(fit: Linearisation, uncertainty: Uncertainty) -> Floats:
@@ -114,6 +127,32 @@ def _step(fit: Linearisation, uncertainty: Uncertainty) -> Floats:
     free = fit.columns(uncertainty.excited).weighted(Huber.of(fit.residuals).roots(fit.residuals))
     step[uncertainty.excited] = free.step(np.eye(len(free.point)) * uncertainty.residual**2)
     return np.asarray(np.clip(fit.point + step, 0.0, 1.0) - fit.point)
+
+
+def with_outlier(setting: Setting, result: CalibrationResult) -> CalibrationResult:
+    """Return a result with the trial that does not fit the others, if there is one: see `outlier`."""
+    trials, space, point = setting.trials, result.space, result.best.point
+    k = candidate(np.array([errors.mean() for errors in result.trial_errors]))
+    if k is None or result.examination is None:
+        return result
+    others = replace(setting, trials=(*trials[:k], *trials[k + 1:]), on_evaluation=lambda _: None)
+    search = LeastSquares(space.dimension, setting.options.seed,
+                          Hints(point, result.examination.uncertainty.excited))
+    try:
+        without = fit(others, space, search, budget(space.dimension)).best
+        evaluation = setting.simulated(space, without)
+    except (CancelledError, SimulationError):
+        return result
+    errors = np.array([errors.mean() for errors in trial_errors(trials, evaluation)])
+    if not is_outlier(k, errors):
+        return result
+    values = space.values(without.point)
+    decided = tuple(name for name, value in values.items() if result.estimates[name].identifiable
+                    and not result.estimates[name].lower <= value <= result.estimates[name].upper)
+    apart = np.linalg.norm(simulated_chains(trials, evaluation)[k] - observed(trials[k])[:, ::-1], axis=2)
+    return replace(result, outlier=Outlier(
+        trials[k].name, k + 1, float(errors[k]), float(np.delete(errors, k).mean()), values,
+        turned=bool(np.nanmean(apart) < 0.5 * errors[k]), decided=decided))
 
 
 def advised(setting: Setting, result: CalibrationResult) -> CalibrationResult:
@@ -148,12 +187,13 @@ def with_missing_parameters(setting: Setting, result: CalibrationResult) -> Cali
 
 
 @contextmanager
-def second_engine(options: Options, make_simulator: SimulatorFactory, first: str
+def second_engine(options: Options, make_simulator: SimulatorFactory, first: str, trials: int
                   ) -> Iterator[Simulator | Exception | None]:
     """
-    Make the engine that confirms the result; its process starts during the search.
+    Make the engine that confirms the result; its processes start during the search.
 
     :param first: name of the engine that searches; it does not confirm itself.
+    :param trials: their number.
     :return: None if no confirmation is wanted; an exception if the engine cannot be made.
     """
     simulator: Simulator | Exception | None = None
@@ -164,7 +204,7 @@ def second_engine(options: Options, make_simulator: SimulatorFactory, first: str
             except Exception as error:
                 simulator = error
         if isinstance(simulator, ProcessSimulator):
-            simulator.start()
+            simulator.start(min(trials, options.workers or cores(), MOST_PROCESSES))
         yield simulator
 
 
@@ -192,8 +232,9 @@ def confirming(result: CalibrationResult, second: Simulator | Exception | None,
         yield lambda unconfirmed: unconfirmed
     else:
         evaluator = Evaluator(result.trials, result.space, second)
-        with closing(Threads(1)) as thread:
-            pool = Pool(second, thread, late, memory)
+        threads = Threads(second.processes if isinstance(second, ProcessSimulator) else 1)
+        with closing(threads):
+            pool = Pool(second, threads, late, memory)
             try:
                 yield partial(_confirmed, evaluator, pool.begin(evaluator.jobs(result.best.point)))
             finally:
@@ -203,7 +244,7 @@ def confirming(result: CalibrationResult, second: Simulator | Exception | None,
 def confirmed(result: CalibrationResult, options: Options, make_simulator: SimulatorFactory
               ) -> CalibrationResult:
     """Return a result with the confirmation by a second engine; see `confirming`."""
-    with second_engine(options, make_simulator, result.engine) as second, \
+    with second_engine(options, make_simulator, result.engine, len(result.trials)) as second, \
             confirming(result, second) as confirm:
         return confirm(result)
 
@@ -229,10 +270,10 @@ def _confirmed(evaluator: Evaluator, rollouts: Callable[[], Sequence[Rollout | S
     except Exception as error:
         return _unconfirmed(error, result)
     chains = simulated_chains(result.trials, other)
-    apart = np.concatenate([np.linalg.norm(first - second, axis=2).ravel()
+    distances = np.concatenate([np.linalg.norm(first - second, axis=2).ravel()
                             for first, second in zip(result.chains, chains, strict=True)])
     confirmation = Confirmation(engine, other.score, other.scores, other.errors,
-                                float(apart.mean()), float(apart.max()))
+                                float(distances.mean()), float(distances.max()))
     differences = disagreements([trial.name for trial in result.trials], result.chains, chains,
                                 best.scores, other.scores)
     warnings = result.warnings

@@ -4,7 +4,7 @@
 """
 Document: all that a person entered about photographs of a DLO: scales, clicks, and the steps of the hands.
 
-It is plain JSON, which the page edits.  `Document.of` checks it, as it may come from a stranger.
+It is plain JSON, which the page edits.  `Document.of` checks it: it may be a stranger's.
 """
 
 from __future__ import annotations
@@ -30,10 +30,6 @@ ID = re.compile('[a-z0-9]{8}')
 Pixel = tuple[float, ...]  # u, v
 
 
-def _refused(where: str, came: str, expected: str) -> InputError:
-    return InputError(where, came, expected, REMEDY)
-
-
 def _pixel(entry: JsonValue) -> Pixel:
     return entry.numbers(2, -LARGEST_PIXEL, LARGEST_PIXEL)
 
@@ -44,17 +40,21 @@ def _id(entry: JsonValue) -> str:
     return str(entry.value)
 
 
+def _refused(where: str, came: str, expected: str) -> InputError:
+    return InputError(where, came, expected, REMEDY)
+
+
 def _optional_id(entry: JsonValue) -> str | None:
     return _id(entry) if entry.given else None
 
 
 def _each(noun: str, most: int, read: Callable[[JsonValue], Any]) -> Callable[[JsonValue], Any]:
-    """Return what reads a list, of which each entry is called by a noun."""
+    """Return a reader of lists; errors name an entry by the noun and its number."""
     return lambda entry: tuple(map(read, entry.entries(0, most, noun)))
 
 
 def _kind(name: str) -> Any:
-    """Declare the field that tells which kind of scale an object is."""
+    """Declare the field with the kind of a scale."""
     return entry_field(lambda entry: entry.choice([name]), name, init=False)
 
 
@@ -180,7 +180,7 @@ class Document:
 
     def __post_init__(self) -> None:
         if len(self.by_id) < len(self.photographs):
-            raise _refused('photographs', 'one id twice', 'an id of its own for each')
+            raise _refused('photographs', 'the same id twice', 'an id of its own for each')
         for number, trial in enumerate(self.trials, start=1):
             for identity in trial.photographs:
                 self._require(identity, f'trial {number}')
@@ -195,9 +195,9 @@ class Document:
     @classmethod
     def of(cls, given: Any) -> Document:
         """
-        Return the document of plain values; what is not given has its default.
+        Return the document of plain values; missing ones have their defaults.
 
-        :raises InputError: where something is wrong; the text says where.
+        :raises InputError: for a wrong value; the text names its place.
         """
         return JsonValue('', given).record(cls)
 
@@ -207,10 +207,10 @@ class Document:
 
     def with_photograph(self, entry: PhotographEntry) -> Document:
         """
-        Return the document with one more photograph, which also takes its place in a trial.
+        Return the document with one more photograph, which is also given a place in a trial.
 
-        It is the goal of the last trial if that has none; else of a new trial, which starts at the last goal.
-        The first photograph of all is the start of the first trial.
+        It becomes the goal of the last trial if that has none; else the goal of a new trial, which starts at
+        the last goal.  The very first photograph becomes the start of the first trial.
         """
         trials = self.trials
         if not trials:
@@ -221,7 +221,7 @@ class Document:
             trials = (*trials, TrialEntry(trials[-1].goal, entry.id, start_side=trials[-1].goal_side))
         if len(self.photographs) >= MOST_PHOTOGRAPHS:
             raise InputError('photographs', f'more than {MOST_PHOTOGRAPHS}', 'fewer',
-                             'remove some, or go on in another folder')
+                             'remove some, or continue in another folder')
         return replace(self, photographs=(*self.photographs, entry), trials=trials)
 
     def scale_of(self, photograph: PhotographEntry) -> PhotographEntry:
@@ -232,7 +232,7 @@ class Document:
 
     def _require(self, identity: str, where: str) -> None:
         if identity not in self.by_id:
-            raise _refused(where, f'a photograph {identity!r} that is not there', 'the id of a photograph')
+            raise _refused(where, f'an unknown photograph {identity!r}', 'the id of a photograph')
 
     def _check_scale(self, photograph: PhotographEntry, where: str) -> None:
         seen = {photograph.id}

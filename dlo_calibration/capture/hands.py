@@ -4,8 +4,8 @@
 """
 Hands: the steps that a person enters, and the paths of the hands that they mean.
 
-Most kinds of steps are named actions (`dlo_calibration.model.named_actions`); `path` is a way that the person
-drew.  The chains before and after give the places where the hands close and open.
+Most kinds of steps are named actions (`dlo_calibration.model.named_actions`); `path` is drawn by the person.
+The chains before and after give the places where the hands close and open.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.named_actions import NAMED_ACTIONS
 
 PAUSE = 1.0  # s between steps, and before the goal: people wait until the DLO is at rest
-RAISED = 0.005  # m; a hand that is higher above its point's place on the table holds it in the air
-BESIDE = 0.02  # m; a target that is so near to the goal's point is meant to be this point
+RAISED = 0.005  # m; a hand higher than this above its point's place on the table holds it in the air
+BESIDE = 0.02  # m; a target nearer than this to the goal's point means that point
 NAME_LENGTH = 40  # characters of a hand's name
-MOST_WAYPOINTS = 50  # of a drawn way
+MOST_WAYPOINTS = 50  # of a drawn path
 LARGEST_PLACE = 100.0  # m from the origin of the table's frame
 
 
@@ -34,8 +34,8 @@ class Field:
     """
     One field of a step.
 
-    :param default: its value where the document does not give one.
-    :param form: what it is: `number`, `truth`, `choice`, `name`, `names`, `numbers`, `place`, `waypoints`.
+    :param default: its value where the document has none.
+    :param form: `number`, `truth`, `choice`, `name`, `names`, `numbers`, `place` or `waypoints`.
     :param choices: the values that a `choice` has.
     """
 
@@ -54,7 +54,7 @@ def _waypoint(entry: JsonValue) -> tuple[float, ...]:
     return x, y, height
 
 
-#: Form of a field -> what returns the value of an entry, checked.
+#: Form of a field -> reader that checks and returns the value of an entry.
 READERS: Mapping[str, Callable[[Field, JsonValue], Any]] = {
     'number': lambda field, entry: entry.number(field.minimum or 0.0, field.maximum or 0.0),
     'truth': lambda _, entry: entry.truth(),
@@ -72,7 +72,7 @@ class Kind:
     """
     A kind of step.
 
-    :param text: which parameters it shows, for the person who chooses.
+    :param text: what the hand does, and which parameters that shows.
     """
 
     title: str
@@ -119,8 +119,8 @@ KINDS: Mapping[str, Kind] = {
          'moving': Field('both', 'choice', choices=('both', 'first', 'second')), 'height': _length(0.0),
          'speed': _SPEED, 'hold': _hold(True)}),
     'path': Kind(
-        'Along a drawn way', 'The hand carries a point along the places that are drawn, each at a height. '
-        'What it shows depends on the way.',
+        'Along a drawn path', 'The hand carries a point along a path that you draw, at a height that you '
+        'choose at each place. What it shows depends on the path.',
         {**_HAND, 'waypoints': Field((), 'waypoints', 'm'), 'speed': _SPEED, 'hold': _hold(False)}),
     'release': Kind(
         'Release', 'A hand that still holds the DLO opens where it is. After a lift, it shows the bends that '
@@ -135,7 +135,7 @@ class StepEntry:
 
     :param kind: one of `KINDS`.
     :param values: all fields of the kind, by name.
-    :param with_previous: True: it begins with the step before it; False: after all before it have ended.
+    :param with_previous: True: it begins with the step before it; False: after the end of all before it.
     """
 
     kind: str
@@ -144,7 +144,7 @@ class StepEntry:
 
     @classmethod
     def of(cls, values: JsonValue) -> StepEntry:
-        """Return the step of a document; what is not given has its default."""
+        """Return the step of a document; missing values have their defaults."""
         kind = values.entry('kind').choice(tuple(KINDS))
         fields = KINDS[kind].fields
         values.only('kind', 'with_previous', *fields)
@@ -155,19 +155,18 @@ class StepEntry:
     @property
     def hands(self) -> tuple[str, ...]:
         """The names of the hands that it moves or opens."""
-        names: tuple[str, ...] = self.values.get('hands') or (self.values['hand'],)
-        return names
+        return tuple(self.values.get('hands') or (self.values['hand'],))
 
     @property
     def fractions(self) -> tuple[float, ...]:
-        """Where the hands grip, each as a fraction of the length; none where they hold it already."""
+        """Where the hands grip, each as a fraction of the length; empty: they hold the DLO already."""
         if 'fraction' in self.values:
             return (self.values['fraction'],)
         return tuple(self.values.get('fractions', ()))
 
     @property
     def json_entries(self) -> dict[str, Any]:
-        """The step as a document has it."""
+        """The values of the step in a document."""
         return {'kind': self.kind, **self.values, 'with_previous': self.with_previous}
 
 
@@ -186,7 +185,7 @@ class Hold:
 
 
 def held_after(steps: Sequence[StepEntry], before: Sequence[Hold] = ()) -> tuple[Hold, ...]:
-    """Return which hands hold the DLO after some steps, if those in `before` hold it at first."""
+    """Return the hands that hold the DLO after some steps, if those in `before` hold it at first."""
     held = {hold.hand: hold for hold in before}
     for step in steps:
         for name in step.hands:
@@ -212,7 +211,7 @@ def described() -> list[dict[str, Any]]:
 
 @dataclass
 class _Path:
-    """The path of one hand from closing to opening, while it is put together."""
+    """The path of one hand from closing to opening, while it is built."""
 
     name: str
     grip: int
@@ -231,13 +230,13 @@ class _Path:
 @dataclass(frozen=True)
 class Movements:
     """
-    What the hands of a trial did.
+    The movements of the hands in a trial.
 
-    :param hands: their paths, in the order of their closing.
+    :param hands: their paths, in the order of closing.
     :param held_by: names of those that hold the DLO in the goal.
-    :param end: when all of them have arrived or opened [s].
-    :param unknown: numbers, from 1, of steps that grip a point which an earlier step may have moved, so that
-        nobody knows where the hand closed.
+    :param end: time at which all of them have arrived or opened [s].
+    :param unknown: numbers, from 1, of steps that grip a point which an earlier step may have moved: where
+        the hand closed is unknown.
     """
 
     hands: tuple[Hand, ...]
@@ -263,7 +262,7 @@ class Movements:
 class _Paths:
     """The paths of the hands of a trial, while the steps are performed."""
 
-    known: Floats  # (n, 3) places of the chain's points, as far as they are known [m]
+    places: Floats  # (n, 3) of the chain's points, as far as they are known [m]
     goal: Chain
     radius: float
     measured_height: bool
@@ -285,9 +284,9 @@ class _Paths:
             if name in self.held and self.held[name].times[-1] > begin:
                 raise InputError(f'hand {name}', 'two steps at the same time', 'one after the other',
                                  'clear "with the previous step", or name another hand')
-        ways = self._ways(step, grips)
+        hand_paths = self._hand_paths(step, grips)
         end = begin
-        for name, grip, (times, positions) in zip(step.hands, grips, ways, strict=True):
+        for name, grip, (times, positions) in zip(step.hands, grips, hand_paths, strict=True):
             path = self.held.pop(name, None)
             if path is not None and path.grip != grip and path.times == [begin]:
                 self.paths.remove(path)  # it held from before, and opened before it moved
@@ -298,7 +297,7 @@ class _Paths:
                 self.paths.append(path)
             path.times += [begin + time for time in times[1:]]
             path.positions += list(positions[1:])
-            self.known[grip] = positions[-1]
+            self.places[grip] = positions[-1]
             self.moved.add(grip)
             if step.values['hold']:
                 self.held[name] = path
@@ -309,28 +308,28 @@ class _Paths:
         for name in names:
             if name not in self.held:
                 raise InputError(f'hand {name}', 'a release, but it holds nothing', 'a hand that holds',
-                                 'remove this step, or let an earlier step hold')
+                                 'remove this step, or let an earlier step hold the DLO')
             self.held.pop(name).rest_until(begin)
         return begin
 
-    def _ways(self, step: StepEntry, grips: Sequence[int]) -> list[tuple[Floats, Floats]]:
+    def _hand_paths(self, step: StepEntry, grips: Sequence[int]) -> list[tuple[Floats, Floats]]:
         """Return the times (k,) [s] from the beginning of a step, and positions (k, 3) [m], of each hand."""
         values, grip, speed = step.values, grips[0], step.values['speed']
         if step.kind == 'path':
-            places = [self.known[grip], *(np.array([x, y, self.radius + height])
+            places = [self.places[grip], *(np.array([x, y, self.radius + height])
                                           for x, y, height in values['waypoints'])]
             return [_along(places, speed)]
         if step.kind in ('lift_and_hold', 'push_down') and self.measured_height and values['hold']:
-            return [_along([self.known[grip], self.goal.points[grip]], speed)]
-        given = {name: value for name, value in values.items() if name not in ('fraction', 'fractions')}
-        if 'to' in given:
-            given['to'] = tuple(self._target(grip, given['to']).tolist())
-        gripped = {'points': tuple(grips)} if step.kind == 'two_hands' else {'point': grip}
-        action = NAMED_ACTIONS[step.kind](**gripped, **given).action(Chain(self.known))
+            return [_along([self.places[grip], self.goal.points[grip]], speed)]
+        fields = {name: value for name, value in values.items() if name not in ('fraction', 'fractions')}
+        if 'to' in fields:
+            fields['to'] = tuple(self._target(grip, fields['to']).tolist())
+        points = {'points': tuple(grips)} if step.kind == 'two_hands' else {'point': grip}
+        action = NAMED_ACTIONS[step.kind](**points, **fields).action(Chain(self.places))
         return [(hand.times, hand.positions) for hand in action.hands]
 
     def _target(self, grip: int, to: tuple[float, ...] | None) -> Floats:
-        """Return where a hand lets a point go, (3,) [m]."""
+        """Return the place (3,) where a hand opens [m]."""
         seen: Floats = self.goal.points[grip]
         if to is None:
             return seen
@@ -376,9 +375,9 @@ def move(steps: Sequence[StepEntry], start: Chain, goal: Chain, grip_of: Callabl
 
 def _along(places: Sequence[Floats], speed: float) -> tuple[Floats, Floats]:
     """Return times and positions of a hand that goes straight from place to place."""
-    way = [places[0]]
+    positions = [places[0]]
     for place in places[1:]:
-        if np.linalg.norm(place - way[-1]) > 1e-6:  # m
-            way.append(place)
-    lengths = np.linalg.norm(np.diff(way, axis=0, prepend=way[:1]), axis=1)
-    return np.cumsum(lengths / speed), np.array(way)
+        if np.linalg.norm(place - positions[-1]) > 1e-6:  # m
+            positions.append(place)
+    lengths = np.linalg.norm(np.diff(positions, axis=0, prepend=positions[:1]), axis=1)
+    return np.cumsum(lengths / speed), np.array(positions)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-JSON values: the objects, lists and numbers of a document, checked, with the place of what is wrong.
+JSON values: the checked objects, lists and numbers of a document; an error names its place.
 
 Validation libraries name places and remedies for programmers; here each error is a sentence for the person.
 """
@@ -17,7 +17,7 @@ from typing import Any, Callable, Iterator, Mapping, Sequence, TypeVar
 
 from dlo_calibration.errors import InputError, suggestion
 
-REMEDY = 'correct the document, or take the action back'
+REMEDY = 'correct the document, or undo the change'
 
 Record = TypeVar('Record')
 
@@ -84,7 +84,7 @@ class JsonValue:
         return self.value
 
     def entries(self, least: int, most: int, noun: str = '') -> Iterator[JsonValue]:
-        """Yield the values of a list; each is called by the noun and its number, from 1."""
+        """Yield the values of a list; their places have the noun and the number, from 1."""
         place = f'{self.where} ' if not noun else self.where[:self.where.rfind(' ') + 1] + f'{noun} '
         if not isinstance(self.value, (list, tuple)) or not least <= len(self.value) <= most:
             raise self.refused(_shown(self.value), f'a list of {least} to {most}')
@@ -92,22 +92,22 @@ class JsonValue:
             yield JsonValue(f'{place}{number}', value)
 
     def numbers(self, count: int, low: float, high: float) -> tuple[float, ...]:
-        """Return a list of so many numbers in a range."""
+        """Return a list of `count` numbers in a range."""
         return tuple(entry.number(low, high) for entry in self.entries(count, count))
 
-    def only(self, *known: str) -> None:
-        """Refuse an object that has names other than these."""
-        unknown = next((name for name in self._content if name not in known), None)
+    def only(self, *names: str) -> None:
+        """Refuse an object with other names than these."""
+        unknown = next((name for name in self._content if name not in names), None)
         if unknown is not None:
             raise InputError(self.where or 'document', f'an unknown field {_shown(unknown)}',
-                             f'fields of {", ".join(known)}', suggestion(unknown, known, REMEDY))
+                             f'fields of {", ".join(names)}', suggestion(unknown, names, REMEDY))
 
     def entry(self, name: str, default: Any = None) -> JsonValue:
         """Return a value of an object by its name; the default where there is none."""
         return JsonValue(f'{self.where}, {name}' if self.where else name, self._content.get(name, default))
 
     def record(self, kind: type[Record]) -> Record:
-        """Return an object as a dataclass, each of whose fields was declared by `entry_field`."""
+        """Return an object as a dataclass, whose fields are declared by `entry_field`."""
         declared = {field.name: field for field in fields(kind)}  # type: ignore[arg-type]
         self.only(*declared)
         values = {name: field.metadata['read'](
@@ -133,9 +133,9 @@ def entry_field(read: Callable[[JsonValue], Any], default: Any = MISSING, init: 
 
 def parsed(octets: bytes) -> Any:
     """
-    Return the values in a JSON file; nan and infinity are not among them.
+    Return the values in a JSON file, without nan and infinity.
 
-    :raises ValueError: or RecursionError, where it is no such file.
+    :raises ValueError: or RecursionError, if it is damaged.
     """
     return json.loads(octets, parse_constant=_refuse_constant)
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache, partial
-import time
 from typing import Any, Callable, Hashable, Mapping, Sequence, TypeVar, Union
 
 import numpy as np
@@ -18,44 +17,29 @@ from dlo_calibration.errors import DEFECT, InputError
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.vision.axis import Axis, axis_of, measured_diameter
 from dlo_calibration.vision.board import find_board
-from dlo_calibration.vision.camera import Lens
+from dlo_calibration.vision.lens import Lens
 from dlo_calibration.vision.middle_line import along_line, arc_lengths
 from dlo_calibration.vision.pose import scale_from_points
 from dlo_calibration.vision.scale import grid, Scale
 from dlo_calibration.vision.tracer import Trace, Tracer
 
 ANSWER_REACH = 3.0  # widths of the DLO between a crossing and the pixel of the answer that belongs to it
-LATTICE = 25, 19  # columns and rows of pixels whose places on the table the page knows
-TRACERS = 3  # kept in memory, each with what it prepared of its photograph
+LATTICE = 25, 19  # columns and rows of pixels whose places on the table are sent to the page
+TRACERS = 3  # in memory, each with its prepared photograph
 
 Value = TypeVar('Value')
 
 
 @dataclass(frozen=True, eq=False)
-class Marked:
-    """
-    A scale and the points that it was made of.
-
-    :param pixels: (k, 2) [px].
-    :param table: (k, 2) [m].
-    """
-
-    scale: Scale
-    pixels: Floats
-    table: Floats
-
-
-@dataclass(frozen=True, eq=False)
 class Measurement:
     """
-    What was measured in a photograph.
+    The measurement of a photograph.
 
     :param problem: why the photograph cannot be read; likewise `scale_problem` and `trace_problem`.
-    :param marked: the points of its own scale; None where it has another's.
-    :param seconds: that tracing took.
+    :param marks: (k, 2) pixels of the points of its own scale; empty: it has another one's scale, or none.
     :param above: index of a crossing -> whether its first strand is above, as answered or else suggested.
     :param answered: indices of the crossings with an answer.
-    :param diameter: of the DLO, as measured in this photograph [m]; `thickness`: as it is used for all.
+    :param diameter: of the DLO, measured in this photograph [m]; `thickness`: the one used for all [m].
     :param axis: of the DLO, if it lies on the table; `axis_problem`: why it has none.
     :param count: number of points of the chain.
     """
@@ -65,10 +49,9 @@ class Measurement:
     problem: str | None = None
     scale: Scale | None = None
     scale_problem: str | None = None
-    marked: Marked | None = None
+    marks: Floats = field(default_factory=lambda: np.zeros((0, 2)))
     trace: Trace | None = None
     trace_problem: str | None = None
-    seconds: float = 0.0
     above: Mapping[int, bool] = field(default_factory=dict)
     answered: frozenset[int] = frozenset()
     diameter: float | None = None
@@ -84,7 +67,7 @@ class Measurement:
 
     @cached_property
     def plain(self) -> dict[str, Any]:
-        """What the page draws, as plain values."""
+        """The measurement as plain values, for the page."""
         return {'width': self.size[0], 'height': self.size[1], 'problem': self.problem,
                 'scale': self._plain_scale(), 'scale_problem': self.scale_problem,
                 'trace': self._plain_trace(), 'trace_problem': self.trace_problem}
@@ -92,13 +75,11 @@ class Measurement:
     def _plain_scale(self) -> dict[str, Any] | None:
         if self.scale is None:
             return None
-        own = self.marked
         return {'residual': self.scale.residual, 'residuals': numbers(self.scale.residuals, 6),
-                'notes': list(self.scale.notes), 'board': None,
+                'warnings': list(self.scale.warnings),
                 'grid': [{'pixels': numbers(line, 1), 'label': label}
                          for label, line in grid(self.scale)],
-                'pixels': [] if own is None else numbers(own.pixels),
-                'table': [] if own is None else numbers(own.table, 6),
+                'pixels': numbers(self.marks),
                 'lattice': _lattice(self.scale)}
 
     def _plain_trace(self) -> dict[str, Any] | None:
@@ -115,11 +96,11 @@ class Measurement:
             chain = numbers(along_line(trace.pixels, along, places))
         return {'pixels': numbers(trace.pixels), 'sure': trace.sure.tolist(), 'width': trace.width,
                 'crossings': crossings, 'length': None if axis is None else axis.length,
-                'diameter': self.diameter, 'seconds': self.seconds, 'chain': chain}
+                'diameter': self.diameter, 'chain': chain}
 
 
 def _lattice(scale: Scale) -> dict[str, Any]:
-    """Return columns and rows of pixels, and where on the table each row of their crossings is [m]."""
+    """Return columns and rows of pixels, and the places on the table of the crossings in each row [m]."""
     width, height = scale.size
     columns, rows = np.linspace(0, width - 1, LATTICE[0]), np.linspace(0, height - 1, LATTICE[1])
     table = scale.points(np.stack(np.meshgrid(columns, rows), axis=-1))[:, :2].reshape(*LATTICE[::-1], 2)
@@ -130,41 +111,41 @@ def _lattice(scale: Scale) -> dict[str, Any]:
 
 class Measurer:
     """
-    Measures the photographs of a project, and remembers what did not change, so that a click costs one trace.
+    Measures the photographs of a project; unchanged parts are cached, so that a click costs one trace.
 
     It belongs to one thread.  `tracer` returns the tracer of a photograph, given by its id.
     """
 
     def __init__(self, project: Project) -> None:
         self._project = project
-        self._document = project.document  # as it is while it is measured
+        self._document = project.document  # the one that is being measured
         self.tracer = lru_cache(TRACERS)(lambda photograph: Tracer(project.photograph(photograph).pixels))
-        self._known: dict[tuple[str, str], tuple[Hashable, Any]] = {}
+        self._cache: dict[tuple[str, str], tuple[Hashable, Any]] = {}  # step, photograph -> key, value
 
     def measure(self, document: Document) -> dict[str, Measurement]:
-        """Return what is measured in each photograph of a document, by its id."""
+        """Return the measurement of each photograph of a document, by its id."""
         self._document = document
-        self._known = {key: value for key, value in self._known.items() if key[1] in document.by_id}
+        self._cache = {key: value for key, value in self._cache.items() if key[1] in document.by_id}
         measured = {entry.id: self._measured(entry) for entry in document.photographs}
         sides = {side for trial in document.trials for side in (trial.start_side, trial.goal_side)}
         diameter = document.dlo.diameter or _median_diameter(
             [measurement for name, measurement in measured.items() if name not in sides])
         return {name: self._with_axis(measurement, diameter) for name, measurement in measured.items()}
 
-    def _attempt(self, what: str, photograph: str, key: Hashable,
+    def _attempt(self, step: str, photograph: str, key: Hashable,
                  make: Callable[[], Value]) -> Union[Value, InputError]:
-        """Return what `make` returns or refuses; it is called only where the key changed."""
-        known = self._known.get((what, photograph))
-        if known is not None and known[0] == key:
-            return known[1]  # type: ignore[no-any-return]
+        """Return the value of `make` or its error; it is called only if the key changed."""
+        cached = self._cache.get((step, photograph))
+        if cached is not None and cached[0] == key:
+            return cached[1]  # type: ignore[no-any-return]
         value: Union[Value, InputError]
         try:
             value = make()
         except InputError as error:
             value = error
         except Exception as error:  # a defect of this package must not cost the other photographs
-            value = InputError(f'{what} of the photograph', repr(error), 'something that can be used', DEFECT)
-        self._known[what, photograph] = key, value
+            value = InputError(f'{step} of the photograph', repr(error), 'a result', DEFECT)
+        self._cache[step, photograph] = key, value
         return value
 
     def _measured(self, entry: PhotographEntry) -> Measurement:
@@ -178,34 +159,35 @@ class Measurer:
         if isinstance(marked, InputError):
             measurement = replace(measurement, scale_problem=str(marked))
         elif marked is not None:
-            measurement = replace(measurement, scale=marked.scale, marked=marked if owner is entry else None)
+            scale, marks = marked
+            measurement = replace(measurement, scale=scale, marks=marks if owner is entry else marks[:0])
         if len(entry.clicks) < 2:
             return measurement
-        traced = self._attempt('trace', entry.id, entry.clicks, partial(self._traced, entry))
-        if isinstance(traced, InputError):
-            return replace(measurement, trace_problem=str(traced))
-        trace, seconds = traced
+        trace = self._attempt('trace', entry.id, entry.clicks,
+                              lambda: self.tracer(entry.id).trace(np.array(entry.clicks)))
+        if isinstance(trace, InputError):
+            return replace(measurement, trace_problem=str(trace))
         above, answered = answers(entry, trace)
         diameter = None
         if measurement.scale is not None:
             diameter = self._attempt('diameter', entry.id, (trace, measurement.scale), partial(
                 measured_diameter, trace, measurement.scale))
-        return replace(measurement, trace=trace, seconds=seconds, above=above, answered=answered,
+        return replace(measurement, trace=trace, above=above, answered=answered,
                        diameter=None if isinstance(diameter, InputError) else diameter)
 
     def _scale(self, owner: PhotographEntry, entry: PhotographEntry,
-               size: tuple[int, int]) -> Union[Marked, InputError, None]:
-        """Return the scale that a photograph has, its own or that of another one."""
+               size: tuple[int, int]) -> Union[tuple[Scale, Floats], InputError, None]:
+        """Return the scale of a photograph, its own or that of its `owner`, and the owner's marks (k, 2)."""
         if owner.scale is None:
             return None
         lens = self._project.lens
         marked = self._attempt('scale', owner.id, (owner.scale, lens), lambda: self._marked(owner, lens))
-        if isinstance(marked, Marked) and marked.scale.size != size:
+        if isinstance(marked, tuple) and marked[0].size != size:
             return InputError(f'scale of {entry.name}', f'that of {owner.name}, which has another size',
                               'one of the same camera', 'give this photograph a scale of its own')
         return marked
 
-    def _marked(self, owner: PhotographEntry, lens: Lens | None) -> Marked:
+    def _marked(self, owner: PhotographEntry, lens: Lens | None) -> tuple[Scale, Floats]:
         photograph = self._project.photograph(owner.id)
         if isinstance(owner.scale, BoardScale):
             pixels, table = find_board(photograph.pixels, printed=owner.scale.ruler)
@@ -213,16 +195,10 @@ class Measurer:
             assert isinstance(owner.scale, PointsScale)
             pixels, table = (np.array([getattr(point, name) for point in owner.scale.points]).reshape(-1, 2)
                              for name in ('pixel', 'table'))
-        scale = scale_from_points(pixels, table, photograph.size, lens, photograph.focal_length)
-        return Marked(scale, pixels, table)
-
-    def _traced(self, entry: PhotographEntry) -> tuple[Trace, float]:
-        begin = time.perf_counter()
-        trace = self.tracer(entry.id).trace(np.array(entry.clicks))
-        return trace, time.perf_counter() - begin
+        return scale_from_points(pixels, table, photograph.size, lens, photograph.focal_length), pixels
 
     def _with_axis(self, measurement: Measurement, diameter: float | None) -> Measurement:
-        """Return a measurement with the axis; the same object as long as nothing changed."""
+        """Return a measurement with the axis; the same object until something changes."""
         trace, scale, photograph = measurement.trace, measurement.scale, measurement.entry.id
         axis: Union[Axis, InputError, None] = None
         if trace is not None and scale is not None and diameter is not None:
@@ -236,14 +212,14 @@ class Measurer:
 
 
 def _median_diameter(measurements: Sequence[Measurement]) -> float | None:
-    """Return the diameter as measured in most photographs, to a tenth of a millimetre [m]."""
-    diameters = [one.diameter for one in measurements if one.diameter is not None]
+    """Return the median of the measured diameters, to a tenth of a millimetre [m]."""
+    diameters = [measurement.diameter for measurement in measurements if measurement.diameter is not None]
     return max(round(float(np.median(diameters)), 4), 1e-4) if diameters else None
 
 
 def answers(entry: PhotographEntry, trace: Trace) -> tuple[dict[int, bool], frozenset[int]]:
     """
-    Return which strand is above at crossings: index -> whether the first is; and the indices of answers.
+    Return index of a crossing -> whether its first strand is above, and the indices with an answer.
 
     An answer belongs to the nearest crossing; of several answers to one crossing, the last counts.
     """
@@ -261,9 +237,8 @@ def answers(entry: PhotographEntry, trace: Trace) -> tuple[dict[int, bool], froz
 
 
 def numbers(array: Floats, digits: int = 2) -> list[Any]:
-    """Return an array as lists, rounded; what is not a number becomes None."""
+    """Return an array as lists, rounded; nan and infinity become None."""
     rounded = np.round(np.asarray(array, float), digits)
     values: Any = rounded.astype(object)
     values[~np.isfinite(rounded)] = None
-    plain: list[Any] = values.tolist()
-    return plain
+    return list(values.tolist())

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Project: a folder with all that a person entered, which can be opened again.
+Project: a folder with everything that a person entered, which can be opened again.
 
-It holds `project.json` (the document), the photographs as they came, each named by its id, and `lens.yaml`.
-Photographs that the document no longer has keep their files, so that removing one can be undone.
+It holds `project.json` (the document), the original photographs, each named by its id, and `lens.yaml`.
+Removed photographs keep their files, so that removing can be undone.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from dlo_calibration.capture.document import BoardScale, Document, ID, NAME_LENG
 from dlo_calibration.capture.json_values import parsed
 from dlo_calibration.errors import InputError, safe_line, shortened, unwritable
 from dlo_calibration.reading import read_octets
-from dlo_calibration.vision.camera import Lens, read_lens
+from dlo_calibration.vision.lens import Lens, read_lens
 from dlo_calibration.vision.photograph import Photograph, read_photograph
 from dlo_calibration.workspace.folder import REQUEST, SESSION
 from dlo_calibration.writing import make_folder, whole, write_file
@@ -35,7 +35,7 @@ from dlo_calibration.writing import make_folder, whole, write_file
 DOCUMENT, LENS, LOCK = 'project.json', 'lens.yaml', '.lock'
 PHOTOGRAPHS, CALIBRATION = 'photographs', 'result'  # folders in it
 MOST_OCTETS = 4 * 2**20  # of the document; a full one has 2 MB
-MOST_FILES = 400  # photographs, also those that were removed
+MOST_FILES = 400  # photographs, with the removed ones
 MOST_OCTETS_OF_ALL = 4 * 2**30  # of these
 LENS_OCTETS = 2**20  # of a camera calibration
 IN_MEMORY = 3  # decoded photographs; one of 12 megapixels takes 36 MB
@@ -43,7 +43,7 @@ SUFFIXES = {b'\xff\xd8\xff': '.jpg', b'\x89PN': '.png'}  # first bytes of a file
 
 
 class OldRevision(InputError):
-    """A change that was made to an older state of the document."""
+    """A change of an older state of the document."""
 
 
 class Project:
@@ -60,7 +60,7 @@ class Project:
         _refuse_links(folder)
         make_folder(folder / PHOTOGRAPHS)
         self._lock = _locked(folder)
-        self.problems: list[str] = []  # warnings about what was wrong in the folder when it was opened
+        self.warnings: list[str] = []  # about the folder when it was opened
         self.revision = 1
         self._decoded = lru_cache(IN_MEMORY)(self._read)
         self._decoding = Lock()
@@ -71,7 +71,7 @@ class Project:
             try:
                 self.lens, self.lens_name = read_lens(folder / LENS), LENS
             except InputError as error:
-                self.problems.append(f'The camera calibration in the folder is not used: {error}')
+                self.warnings.append(f'The camera calibration in the folder is not used: {error}')
 
     def close(self) -> None:
         """Let other processes use the folder."""
@@ -83,7 +83,7 @@ class Project:
 
         :param revision: of the document that was changed.
         :raises OldRevision: where another change came first.
-        :raises InputError: where it names a photograph that the folder does not have, or cannot be written.
+        :raises InputError: if a photograph of it is not in the folder, or it cannot be written.
         """
         if revision != self.revision:
             raise OldRevision('document', f'a change of revision {revision}', f'revision {self.revision}',
@@ -97,18 +97,18 @@ class Project:
         """
         Save a photograph, add it to the document, and return its id.
 
-        Its scale is the kind of the photograph before: the board, or the same scale while the camera stays.
+        Its scale is that of the photograph before: the board, or the same scale while the camera stays.
 
         :param octets: content of the file.
         :param name: of the file, as the person knows it; it is only shown.
-        :raises InputError: where it is no photograph, or is one too many.
+        :raises InputError: if it is no photograph, or the folder is full.
         """
         name = shortened(safe_line(name), NAME_LENGTH) or 'photograph'
         photograph = read_photograph(octets, f'photograph {name}')
         files = [path for path in (self.folder / PHOTOGRAPHS).iterdir() if not path.name.startswith('.')]
         if len(files) >= MOST_FILES or sum(path.lstat().st_size for path in files) > MOST_OCTETS_OF_ALL:
             raise InputError(f'folder {self.folder}', f'{len(files)} photographs', 'fewer',
-                             'go on in another folder')
+                             'continue in another folder')
         identity = ''.join(secrets.choice(string.ascii_lowercase + string.digits) for _ in range(8))
         entry = PhotographEntry(identity, name, self._next_scale(photograph))
         document = self.document.with_photograph(entry)
@@ -146,7 +146,7 @@ class Project:
 
         :param octets: content of its file.
         :param name: of the file; it is only shown.
-        :raises InputError: where it cannot be used; the one before is then kept.
+        :raises InputError: if it cannot be used; the one before then stays in use.
         """
         if len(octets) > LENS_OCTETS:
             raise InputError(f'camera calibration {safe_line(name)}', f'more than {LENS_OCTETS} bytes',
@@ -162,12 +162,11 @@ class Project:
 
     def remove_lens(self) -> None:
         """Use no camera calibration."""
-        with suppress(FileNotFoundError):
-            (self.folder / LENS).unlink()
+        (self.folder / LENS).unlink(missing_ok=True)
         self.lens = self.lens_name = None
 
     def _opened(self) -> Document:
-        """Return the document in the folder; an empty one where there is none that can be used."""
+        """Return the document in the folder; an empty one if there is none, or a damaged one."""
         path = self.folder / DOCUMENT
         if not path.exists():
             return Document()
@@ -179,7 +178,7 @@ class Project:
         except InputError as error:
             aside = _free_name(path)
             path.rename(aside)
-            self.problems.append(f'{DOCUMENT} could not be used and is now called {aside.name}; '
+            self.warnings.append(f'{DOCUMENT} could not be used and is now called {aside.name}; '
                              f'the project begins anew. The reason: {error}')
             return Document()
 
@@ -194,31 +193,31 @@ class Project:
 
 def _refuse_links(folder: Path) -> None:
     """
-    Check that what a project reads and writes in its folder is there: regular files and folders.
+    Check that a project will read and write only regular files and folders in its folder.
 
     A link could lead anywhere, and opening a FIFO never ends.
 
-    :raises InputError: for the first other thing.
+    :raises InputError: for the first link, FIFO or other special file.
     """
-    own = [folder / name for name in (DOCUMENT, LENS, LOCK, PHOTOGRAPHS, CALIBRATION, SESSION, REQUEST)]
+    paths = [folder / name for name in (DOCUMENT, LENS, LOCK, PHOTOGRAPHS, CALIBRATION, SESSION, REQUEST)]
     try:
-        while own:
-            path = own.pop()
+        while paths:
+            path = paths.pop()
             with suppress(FileNotFoundError, NotADirectoryError):
                 mode = path.lstat().st_mode
                 if stat.S_ISDIR(mode):
-                    own += path.iterdir()
+                    paths += path.iterdir()
                 elif not stat.S_ISREG(mode):
                     came = 'a link' if stat.S_ISLNK(mode) else 'something that is no file'
                     raise InputError(f'{path}', came, 'the files of a project',
-                                     'remove it, or copy there what it leads to')
+                                     'remove it, or replace it by a copy')
     except OSError as error:
         raise InputError(f'folder {folder}', error.strerror or str(error), 'a folder that can be read',
                          'name another folder') from error
 
 
 def _json(path: Path) -> Any:
-    """Return the plain values in a file, which may come from a stranger."""
+    """Return the plain values in a file, which may be a stranger's."""
     expected, remedy = 'the document of a project', 'restore it from a copy'
     octets = read_octets(path, f'file {path}', expected, MOST_OCTETS)
     if len(octets) > MOST_OCTETS:
@@ -230,13 +229,13 @@ def _json(path: Path) -> Any:
 
 
 def _free_name(path: Path) -> Path:
-    """Return a name for a damaged file that no other file has."""
+    """Return a free name for a damaged file."""
     names = (path.with_name(f'{path.stem}_damaged_{number}{path.suffix}') for number in count(1))
     return next(aside for aside in names if not aside.exists())
 
 
 def _locked(folder: Path) -> Any:
-    """Return an open file that keeps other processes from this folder, until it is closed."""
+    """Return an open file that locks this folder until it is closed."""
     try:
         # A link at this name is not followed.
         descriptor = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)

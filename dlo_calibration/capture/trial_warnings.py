@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Warnings: what the person should know about a trial from photographs, and what to do."""
+"""Warnings about a trial from photographs, and their remedies."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Sequence
 
 import numpy as np
@@ -19,14 +19,14 @@ from dlo_calibration.vision.axis import Axis
 LENGTHS = 0.02  # relative difference of the lengths of start and goal that is worth a warning
 UNSURE = 0.1  # share of a line that is not sure, likewise
 AT_THE_END = 0.02  # share of a line at either end that shows whether its end was found
-BESIDE = 0.006  # m; one line lies on the other where they are so near
+BESIDE = 0.006  # m between two lines, at most, where one lies on the other
 STAYED = 0.5  # share of the points, those that moved least, by which the two directions are compared
-REVERSED = 0.4  # times as far as in the given direction; with less, the other direction fits much better
-LET_GO = 0.1  # of the length, between where a hand let a point go and where the goal shows it
+REVERSED = 0.4  # ratio of the distances in both directions below which the reverse fits much better
+LET_GO = 0.1  # of the length, between the place where a hand opened and the gripped point in the goal
 FREE_END = 0.15  # of the length, from an end: there the DLO springs back by centimetres, not millimetres
-CLEARED = 0.8  # of a diameter, by which the upper strand's curve is above the lower one's
+CLEARED = 0.8  # of a diameter, by which the upper strand is above the lower one, at least
 LONGEST = 3600.0  # s that hands may move
-SIZE_OF_A_MOVE = 0.01  # m; points that move less can hardly be told from noise
+SIZE_OF_A_MOVE = 0.01  # m; a smaller move is hardly distinguishable from noise
 
 
 @dataclass(frozen=True)
@@ -34,8 +34,8 @@ class TrialWarning:
     """
     One sentence or two about a trial.
 
-    :param level: `error`: there is no trial before this is mended; `warning`; `hint`.
-    :param remedy: name of what the page can do about it.
+    :param level: `error`: there is no trial before this is corrected; `warning`; `hint`.
+    :param remedy: name of the page's action against it.
     """
 
     level: str
@@ -43,34 +43,32 @@ class TrialWarning:
     remedy: str | None = None
 
 
-@dataclass
-class TrialWarnings:
+class TrialWarnings(list[TrialWarning]):
     """The warnings about one trial, in the order in which they are shown."""
 
-    entries: list[TrialWarning] = field(default_factory=list)
-
     def error(self, text: str, remedy: str | None = None) -> None:
-        """Add a sentence about what must be mended before there is a trial."""
-        self.entries.append(TrialWarning('error', text, remedy))
+        """Add a fault that must be corrected before there is a trial."""
+        self.append(TrialWarning('error', text, remedy))
 
     def warning(self, text: str, remedy: str | None = None) -> None:
-        """Add a sentence about what is probably wrong."""
-        self.entries.append(TrialWarning('warning', text, remedy))
+        """Add a probable fault."""
+        self.append(TrialWarning('warning', text, remedy))
 
     def hint(self, text: str, remedy: str | None = None) -> None:
-        """Add a sentence about what could be better."""
-        self.entries.append(TrialWarning('hint', text, remedy))
+        """Add a possible improvement."""
+        self.append(TrialWarning('hint', text, remedy))
 
     @property
     def has_errors(self) -> bool:
-        """Whether something must be mended before there is a trial."""
-        return any(entry.level == 'error' for entry in self.entries)
+        """Whether a fault must be corrected before there is a trial."""
+        return any(warning.level == 'error' for warning in self)
 
 
 def check_photograph(warnings: TrialWarnings, photograph: Measurement, which: str, on_table: bool) -> None:
     """
-    Warn of what is missing or doubtful in a photograph, called e.g. `start`.
+    Warn of missing and doubtful things in a photograph.
 
+    :param which: photograph of the trial, e.g. `start`.
     :param on_table: whether the whole DLO lies on the table in it.
     """
     if photograph.problem is not None:
@@ -98,8 +96,8 @@ def check_photograph(warnings: TrialWarnings, photograph: Measurement, which: st
         warnings.error(f'The line in the {which} photograph: {photograph.axis_problem}', 'set_scale')
     unsure = 1.0 - float(trace.sure.mean())
     if unsure > UNSURE:
-        warnings.warning(f'The line in the {which} photograph is not sure along {100 * unsure:.0f} % of it: '
-                         'check it, and add a click there.', 'add_click')
+        warnings.warning(f'The line in the {which} photograph is not sure along {100 * unsure:.0f} % of its '
+                         'length: check it, and add a click there.', 'add_click')
 
 
 def check_axes(warnings: TrialWarnings, axes: tuple[Axis, Axis], chains: tuple[Chain, Chain], shares: Floats,
@@ -110,18 +108,18 @@ def check_axes(warnings: TrialWarnings, axes: tuple[Axis, Axis], chains: tuple[C
     :param shares: (n,) fractions of the length at which the chains have points.
     """
     start, goal = axes
-    here, there = (chain.points for chain in chains)
-    if _fits_better_reversed(here, there):
+    before, after = (chain.points for chain in chains)
+    if _fits_better_reversed(before, after):
         warnings.warning('The goal seems to be traced from the other end than the start, as most of the DLO '
-                         'then stayed where it was: turn the order of its clicks round.', 'reverse_goal')
-        there = there[::-1]
+                         'then stayed in its place: reverse the order of its clicks.', 'reverse_goal')
+        after = after[::-1]
     change = goal.length / start.length - 1.0
     if abs(change) > LENGTHS:
         longer = 'longer' if change > 0 else 'shorter'
         reason = _reason_of_lengths(axes, entry, photographs, change)
         warnings.warning(f'The DLO is {100 * abs(change):.1f} % {longer} in the goal ({goal.length:.3f} m) '
                          f'than in the start ({start.length:.3f} m). {reason}', 'check_length')
-    if float(np.linalg.norm(there - here, axis=1).max()) < SIZE_OF_A_MOVE:
+    if float(np.linalg.norm(after - before, axis=1).max()) < SIZE_OF_A_MOVE:
         warnings.hint('The DLO hardly moved, so this trial shows little: move it further.')
     for which, axis, chain in zip(('start', 'goal'), axes, chains, strict=True):
         if len(axis.over) and (axis.clearances(chain, shares) < CLEARED * axis.diameter).any():
@@ -132,7 +130,7 @@ def check_axes(warnings: TrialWarnings, axes: tuple[Axis, Axis], chains: tuple[C
 def check_hands(warnings: TrialWarnings, movements: Movements, chains: tuple[Chain, Chain], radius: float,
                 entry: TrialEntry, held: Sequence[Hold]) -> None:
     """
-    Warn of what is missing or doubtful about the hands of a trial.
+    Warn of missing and doubtful movements of the hands.
 
     :param radius: of the DLO [m].
     :param held: the hands that hold the DLO at the start.
@@ -160,29 +158,28 @@ def check_hands(warnings: TrialWarnings, movements: Movements, chains: tuple[Cha
                 set(step.hands) & set(movements.held_by)):
             near_end = not FREE_END < step.values['fraction'] < 1 - FREE_END
             warn = warnings.warning if near_end else warnings.hint
-            warn(f'Step {number}: the DLO springs back when the hand opens, so the goal does not quite show '
-                 'where that was. Mark the place in the goal photograph, or take it while the hand still '
-                 'holds.',
-                 'mark_place')
+            warn(f'Step {number}: the DLO springs back when the hand opens, so the goal does not show '
+                 'exactly where it opened. Mark the place in the goal photograph, or take that photograph '
+                 'while the hand still holds the DLO.', 'mark_place')
     last = {grip: hand for hand in movements.hands for grip in hand.grips}
     for grip, hand in last.items():
         moves = bool((hand.positions != hand.positions[0]).any())
         if not moves and any(hold.hand == hand.name for hold in held):
-            continue  # it held the DLO before, and only opens, or goes on holding
-        away = float(np.linalg.norm(hand.positions[-1] - chains[1].points[grip]))
-        if away > LET_GO * chains[0].length:
-            warnings.warning(f'{hand.name} ends {1000 * away:.0f} mm away from where the goal shows the '
-                             'point that it gripped: check where it gripped and let go.')
+            continue  # it held the DLO before, and only opens or keeps holding
+        distance = float(np.linalg.norm(hand.positions[-1] - chains[1].points[grip]))
+        if distance > LET_GO * chains[0].length:
+            warnings.warning(f'{hand.name} ends {1000 * distance:.0f} mm away from its gripped point in the '
+                             'goal: check where it gripped and where it opened.')
         if not moves:
             warnings.hint(f'{hand.name} does not move.')
 
 
-def _fits_better_reversed(here: Floats, there: Floats) -> bool:
+def _fits_better_reversed(before: Floats, after: Floats) -> bool:
     """Tell whether (n, 3) points fit others much better in the reverse order."""
-    stayed = max(int(STAYED * len(here)), 3)
-    given, turned = (float(np.sort(np.linalg.norm(here - other, axis=1))[:stayed].mean())
-                     for other in (there, there[::-1]))
-    return given > SIZE_OF_A_MOVE and turned < REVERSED * given
+    count = max(int(STAYED * len(before)), 3)
+    given, reverse = (float(np.sort(np.linalg.norm(before - points, axis=1))[:count].mean())
+                      for points in (after, after[::-1]))
+    return given > SIZE_OF_A_MOVE and reverse < REVERSED * given
 
 
 def _reason_of_lengths(axes: tuple[Axis, Axis], entry: TrialEntry,

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Trials: drafted from the measured photographs of a start and a goal, and the steps of the hands.
+Trials: drafts from the measured photographs of a start and a goal, and the steps of the hands.
 
-What did not change since the last draft is not computed again.
+A draft reuses the unchanged parts of the last one.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any, Mapping, Sequence
 
 import numpy as np
 
-from dlo_calibration.calibration.options import Options, recordable
+from dlo_calibration.calibration.options import FileOptions, Options, recordable
 from dlo_calibration.capture.document import TrialEntry
 from dlo_calibration.capture.hands import held_after, Hold, move, Movements, PAUSE
 from dlo_calibration.capture.json_values import plain
@@ -31,7 +31,6 @@ from dlo_calibration.files.request import write_request as write_document
 from dlo_calibration.files.session import trial_records
 from dlo_calibration.messages.collector import TrialCollector
 from dlo_calibration.messages.encoder import trial_messages
-from dlo_calibration.model.action import Hand
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.parameters import BY_NAME, SCALE
 from dlo_calibration.model.trial import Goal, Trial
@@ -39,7 +38,7 @@ from dlo_calibration.simulation.nodes import spread_places
 from dlo_calibration.vision.axis import Axis
 from dlo_calibration.vision.two_views import axis_of_two_views
 
-SNAP = 0.25  # spacings of a chain: a hand that is so near to an end, or to another grip, is there
+SNAP = 0.25  # spacings of a chain: a hand nearer than this to an end, or to another grip, is put there
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,32 +46,24 @@ class TrialDraft:
     """
     A trial as far as the document describes it.
 
-    :param trial: as a session records it; None where something is missing or wrong.
-    :param lengths: of the DLO in the start and the goal [m]; None: not known.
-    :param movements: of the hands; None: not known.
+    :param trial: as a session records it; None: it is incomplete or wrong.
+    :param movements: of the hands; None: unknown.
     """
 
     warnings: TrialWarnings
     start: Measurement | None = None
     goal: Measurement | None = None
-    lengths: tuple[float | None, float | None] = (None, None)
     movements: Movements | None = None
     trial: Trial | None = None
 
     @cached_property
     def plain(self) -> dict[str, Any]:
-        """What the page draws, as plain values."""
+        """The draft as plain values, for the page."""
         hands = () if self.movements is None else self.movements.hands
-        return {'complete': self.trial is not None, 'remarks': plain(tuple(self.warnings.entries)),
-                'start_length': self.lengths[0], 'goal_length': self.lengths[1],
-                'hands': [self._plain_hand(hand) for hand in hands]}
-
-    def _plain_hand(self, hand: Hand) -> dict[str, Any]:
-        assert self.movements is not None
-        start, goal = (_pixels(photograph, hand.positions) for photograph in (self.start, self.goal))
-        opens = hand.name not in self.movements.held_by
-        return {'name': hand.name, 'start_pixels': start, 'goal_pixels': goal, 'times': hand.times.tolist(),
-                'grip': start[0] if start else None, 'opens': goal[-1] if goal and opens else None}
+        return {'complete': self.trial is not None, 'warnings': plain(tuple(self.warnings)),
+                'hands': [{'name': hand.name, 'times': hand.times.tolist(),
+                           'start_pixels': _pixels(self.start, hand.positions),
+                           'goal_pixels': _pixels(self.goal, hand.positions)} for hand in hands]}
 
 
 def _pixels(photograph: Measurement | None, positions: Floats) -> list[Any]:
@@ -84,7 +75,7 @@ def _pixels(photograph: Measurement | None, positions: Floats) -> list[Any]:
 def draft_trial(number: int, entry: TrialEntry, photographs: Mapping[str, Measurement],
                 held: Sequence[Hold] = ()) -> TrialDraft:
     """
-    Return the trial that a document describes, or why there is none yet.
+    Return the trial that a document describes, or the warnings that say why there is none yet.
 
     :param number: of the trial, from 1.
     :param photographs: all measurements, by id.
@@ -95,8 +86,7 @@ def draft_trial(number: int, entry: TrialEntry, photographs: Mapping[str, Measur
     end, goal = _axis('goal', entry.goal, entry.goal_side, photographs, warnings)
     if not entry.steps:
         warnings.error('Say what the hand did between the two photographs.', 'add_step')
-    draft = TrialDraft(warnings, begin, end, (None if start is None else start.length,
-                                              None if goal is None else goal.length))
+    draft = TrialDraft(warnings, begin, end)
     if begin is None or start is None or end is None or goal is None:
         return draft
     shares = _shares(entry, held, begin.count)
@@ -126,7 +116,8 @@ def _axis(which: str, photograph: str | None, side: str | None, photographs: Map
     Return the photograph of a start or goal, and the axis of the DLO in it.
 
     :param which: `start` or `goal`.
-    :param photograph: its id; `side`: that of a second one of the same moment.
+    :param photograph: its id.
+    :param side: the id of a second photograph of the same moment, from the side.
     """
     if photograph is None:
         warnings.error('Add a photograph of the DLO after the movement.', 'add_goal')
@@ -162,9 +153,9 @@ def _shares(entry: TrialEntry, held: Sequence[Hold], count: int) -> Floats:
 def _recorded(name: str, chains: tuple[Chain, Chain], movements: Movements,
               warnings: TrialWarnings) -> Trial | None:
     """
-    Return the trial as it is when a recorded session of it is read again.
+    Return the trial as read from a recorded session of it.
 
-    So the page calibrates with exactly the numbers of the session.
+    The page thus calibrates with exactly the numbers of the session.
     """
     try:
         trial = Trial(name, chains[0], movements.actions,
@@ -177,24 +168,24 @@ def _recorded(name: str, chains: tuple[Chain, Chain], movements: Movements,
         return None
     trials = collector.trials
     if len(trials) != 1 or not _same(trials[0], trial):
-        warnings.error('This order of steps cannot be kept in a session: take a photograph between the '
+        warnings.error('A session cannot record this order of steps: take a photograph between the '
                        'movements, and make each a trial of its own.')
         return None
     return replace(trials[0], name=name)
 
 
 def _same(recorded: Trial, trial: Trial) -> bool:
-    """Tell whether a recorded trial has all hands of a trial, with their grips, held alike in the goal."""
-    paths, wanted = ({(hand.name, hand.grips, round(hand.start, 6), round(hand.end, 6))
-                      for hand in given.hands} for given in (recorded, trial))
-    return wanted <= paths and recorded.goals[0].stable and (
+    """Tell whether a recorded trial has all hands and grips of a trial, and the same hands at the goal."""
+    paths, expected = ({(hand.name, hand.grips, round(hand.start, 6), round(hand.end, 6))
+                        for hand in source.hands} for source in (recorded, trial))
+    return expected <= paths and recorded.goals[0].stable and (
         set(recorded.goals[0].held_by) == set(trial.goals[0].held_by))
 
 
 @dataclass(frozen=True, eq=False)
 class Drafts:
     """
-    All that follows from a document.
+    The measurements and trials of a document.
 
     :param photographs: the measurement of each photograph, by its id.
     :param trials: in the order of the document.
@@ -207,7 +198,7 @@ class Drafts:
 
     @cached_property
     def complete(self) -> tuple[Trial, ...]:
-        """The complete trials, named as a session that is read names them."""
+        """The complete trials, with the names that a session gives them."""
         trials = [draft.trial for draft in self.trials if draft.trial is not None]
         return tuple(replace(trial, name=f'trial {number}') for number, trial in enumerate(trials, start=1))
 
@@ -224,9 +215,9 @@ class Drafts:
     @property
     def options(self) -> dict[str, Any]:
         """
-        The options that belong to these trials, by name.
+        The options of these trials, by name.
 
-        The table is the plane of the scale; the search for the radius begins at the DLO's own.
+        The table is the plane of the scale; the search for the radius begins at the measured one.
         """
         options: dict[str, Any] = {'table': True, 'table_height': 0.0, 'mass': self.mass}
         if self.diameter is not None:
@@ -235,7 +226,7 @@ class Drafts:
         return Options.of(options).flat()
 
     def plain(self) -> dict[str, Any]:
-        """Return what the page draws, as plain values."""
+        """Return the drafts as plain values, for the page."""
         return {'photographs': {name: photograph.plain for name, photograph in self.photographs.items()},
                 'trials': [draft.plain for draft in self.trials]}
 
@@ -257,7 +248,7 @@ class Drafter:
         self._measurer.tracer(photograph)
 
     def draft(self) -> Drafts:
-        """Return all that follows from the present document."""
+        """Return the drafts of the present document."""
         document = self._project.document
         photographs = self._measurer.measure(document)
         before, self._drafts = self._drafts, {}
@@ -275,7 +266,7 @@ class Drafter:
 
 def write_session(path: Path, trials: Sequence[Trial], options: Mapping[str, Any]) -> None:
     """
-    Write trials to one MCAP file, as if a robot had done them.
+    Write trials to one MCAP file, as a robot's session.
 
     :param options: by name, to be recorded.
     :raises InputError: where the file cannot be written.
@@ -290,4 +281,4 @@ def write_request(path: Path, trials: Sequence[Trial], options: Mapping[str, Any
     :param options: by name.
     :raises InputError: where there is no trial, or the file cannot be written.
     """
-    write_document(path, Request(tuple(map(TrialRequest.of, trials)), recordable(options)))
+    write_document(path, Request(tuple(map(TrialRequest.of, trials)), FileOptions(recordable(options))))

@@ -17,6 +17,7 @@ from dlo_calibration.messages.codec import INPUT_TYPES
 from dlo_calibration.workspace.source import is_request, Selection
 
 PREFIX = 'option_'  # of the attributes of a parsed command line that are options
+WITHOUT_EFFECT = f'{PREFIX}without_effect_'  # of those that change nothing in a verb
 _NUMBERED = re.compile(r'[xy]?\d+$')  # distinguishes the options of parts, knots or hands
 _FLAG = re.compile('^--[a-z0-9_]+(?==|$)')
 
@@ -50,7 +51,7 @@ def selected(chosen: argparse.Namespace, path: Path | None = None) -> Selection:
     Return what a command line selects of a session or a request.
 
     :param path: of the session or the request; None: the one on the command line.
-    :raises InputError: if a topic or a trial's number is not written as it should be.
+    :raises InputError: if a topic or the number of a trial is malformed.
     """
     return Selection(chosen.session if path is None else path, given_options(chosen), chosen.namespace,
                      _remap(chosen.remap), _without(getattr(chosen, 'without', ())))
@@ -60,7 +61,7 @@ def read_result_file(chosen: argparse.Namespace) -> Description:
     """
     Read the RESULT.xml of a command line.
 
-    :raises InputError: if it cannot be read; the remedy says if it was exchanged with the session.
+    :raises InputError: if it cannot be read; the remedy names a session given in its place.
     """
     try:
         return read_result(chosen.result)
@@ -82,7 +83,7 @@ def _without(texts: Sequence[str]) -> tuple[int, ...]:
 
 
 def _remap(texts: Sequence[str]) -> dict[str, str]:
-    """Return the input topic as which each topic is read."""
+    """Return the remapped topics, each with the input topic that it replaces."""
     remap: dict[str, str] = {}
     for text in texts:
         topic, sign, kind = text.partition(':=')
@@ -101,8 +102,10 @@ def add_options(parser: argparse.ArgumentParser, only: Collection[str] | None = 
                 kind: type[DeclaredOptions] = Options,
                 title: str = 'options of the calibrator (default: as the session was recorded)') -> None:
     """
-    Add a flag for every option of a class, or `only` for some; flags that are not given have no attribute.
+    Add a flag for every option of a class; flags that are not given have no attribute.
 
+    :param only: names of the options that have an effect. The flags of the others are not in the help, and
+        `options_without_effect` returns them.
     :param kind: the class of the options; names of options differ between classes.
     :param title: of the group of flags in the help.
     """
@@ -113,6 +116,17 @@ def add_options(parser: argparse.ArgumentParser, only: Collection[str] | None = 
                   if _NUMBERED.sub('', option.name) == _NUMBERED.sub('', declaration.name)]
         group.add_argument(_dashed(declaration.name), dest=f'{PREFIX}{declaration.name}',
                            default=argparse.SUPPRESS, **_flag(declaration, family))
+    for declaration in kind.declarations():
+        flag = _dashed(declaration.name)
+        if declaration not in wanted and flag not in parser._option_string_actions:
+            group.add_argument(flag, dest=f'{WITHOUT_EFFECT}{declaration.name}', default=argparse.SUPPRESS,
+                               **{**_flag(declaration, [flag]), 'help': argparse.SUPPRESS})
+
+
+def options_without_effect(chosen: argparse.Namespace) -> list[str]:
+    """Return the flags of a command line that are options, but change nothing in its verb."""
+    return [_dashed(name.removeprefix(WITHOUT_EFFECT)) for name in vars(chosen)
+            if name.startswith(WITHOUT_EFFECT)]
 
 
 def dashed(words: Sequence[str]) -> list[str]:
@@ -122,8 +136,8 @@ def dashed(words: Sequence[str]) -> list[str]:
 
 def given_options(chosen: argparse.Namespace, kind: type[DeclaredOptions] = Options) -> dict[str, Any]:
     """Return the options of a class that a command line gives, by name."""
-    known = {f'{PREFIX}{declaration.name}': declaration.name for declaration in kind.declarations()}
-    given = {known[name]: value for name, value in vars(chosen).items() if name in known}
+    names = {f'{PREFIX}{declaration.name}': declaration.name for declaration in kind.declarations()}
+    given = {names[name]: value for name, value in vars(chosen).items() if name in names}
     return {name: [word for text in value for word in text.split(',') if word] if isinstance(value, list)
             else value for name, value in given.items()}
 

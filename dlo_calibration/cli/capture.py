@@ -79,8 +79,8 @@ def serve_page(chosen: argparse.Namespace, make_simulator: SimulatorFactory,
 
     graph = CaptureGraph() if find_spec('rclpy') else None
     with closing(Project(chosen.folder)) as project:
-        for problem in project.problems:
-            print_message(problem)
+        for warning in project.warnings:
+            print_message(warning)
         serve(Studio(project, make_simulator, given_options(chosen), graph), host=chosen.host,
               port=chosen.port, ready=ready, should_stop=should_stop)
     print_message(f'everything is kept in {chosen.folder}')

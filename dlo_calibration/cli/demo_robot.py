@@ -28,7 +28,7 @@ from dlo_calibration.workspace.folder import RESULT
 from dlo_calibration.writing import make_folder
 
 NODE = '/calibrator'  # its full name, the namespace of its topics
-LAST_DOMAIN = 101  # of ROS, up to which no port lies in the operating system's ephemeral range
+LAST_DOMAIN = 101  # of ROS; the ports of higher ones lie in the operating system's ephemeral range
 PATIENCE = 60.0  # s without a message from the node, after which the demo gives up
 
 
@@ -42,12 +42,13 @@ def calibrate_sample(output: Path, sample: Path, evaluations: int, stop: Callabl
     :raises DloCalibrationError: if something does not work.
     """
     session = read_session(sample)
+    recorded = {} if session.file_options is None else session.file_options.values
     make_folder(output)
     os.environ['ROS_DOMAIN_ID'] = str(_unused_domain())
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     os.environ.setdefault('ROS_LOG_DIR', str(output.resolve() / 'ros_log'))
     before = set(output.glob('dlo_session_*'))
-    options = {**(session.recorded or {}), 'evaluations': evaluations,
+    options = {**recorded, 'evaluations': evaluations,
                'output_directory': str(output.resolve())}
     out, log, picture = terminal.console(sys.stdout), output / 'calibrator.log', output / 'demo.png'
     with _node(options, log) as child, _robot(child, log, stop) as robot:
@@ -61,7 +62,7 @@ def calibrate_sample(output: Path, sample: Path, evaluations: int, stop: Callabl
             robot.wait(lambda: _show(robot, bar), 'a result')
     folder, = set(output.glob('dlo_session_*')) - before
     file = read_result(folder / RESULT)
-    used = Options.of(file.options)
+    used = Options.of(file.file_options.values)
     result = validated(file, session_trials(read_session(folder), used)[0], used)
     session_picture(result.trials, result.chains, picture)
     terminal.print_result(result, sys.stdout, {key: getattr(file, key) for key in HOW})

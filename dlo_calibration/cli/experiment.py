@@ -18,6 +18,7 @@ from dlo_calibration.cli.output import print_json, print_message, standard_outpu
 from dlo_calibration.errors import InputError, printable
 from dlo_calibration.experiment import tables
 from dlo_calibration.experiment.conduct import conduct
+from dlo_calibration.experiment.journal import Laboratory
 from dlo_calibration.experiment.study import Observed, Study, Subject
 from dlo_calibration.files.session import samples
 from dlo_calibration.search import SEARCHES
@@ -56,18 +57,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     """Execute the verb; return the exit code."""
-    plan = _study(chosen)
+    study = _study(chosen)
     with StopFlag() as stop:
-        account, attempts = conduct(plan, chosen.output, make_simulator, stop, print_message, sys.stderr)
+        workers = Options.of(given_options(chosen)).workers
+        laboratory = Laboratory(chosen.output, workers, stop, print_message, sys.stderr)
+        account = conduct(study, laboratory, make_simulator)
     if account is None:
-        attempts.require()
+        laboratory.attempts.require()
         raise KeyboardInterrupt(stop.exit_code)
     if chosen.json:
         print_json(tables.document(account))
     else:
         with standard_output() as stream:
             stream.write(tables.markdown(account))
-    attempts.require()
+    laboratory.attempts.require()
     return 0 if account.complete else stop.exit_code
 
 
@@ -93,8 +96,8 @@ def _study(chosen: argparse.Namespace) -> Study:
         judges = _observed(chosen, others[k], FileOptions(own.options.flat())) if others else None
         subjects.append(Subject(name, own, held, judges))
     options = subjects[0].observed.options
-    return Study(tuple(subjects), searches, chosen.runs, options.seed, options.workers,
-                _command(chosen, searches), samples=not chosen.sessions)
+    return Study(tuple(subjects), searches, chosen.runs, options.seed, _command(chosen, searches),
+                 samples=not chosen.sessions)
 
 
 def _observed(chosen: argparse.Namespace, path: Path, of_result: FileOptions | None = None) -> Observed:

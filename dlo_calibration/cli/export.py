@@ -30,7 +30,7 @@ FORMATS: Mapping[str, tuple[Callable[..., str], tuple[str, ...]]] = {
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    forms = '; '.join(f'of {name}: {", ".join(known)}' for name, (_, known) in FORMATS.items() if known)
+    forms = '; '.join(f'of {name}: {", ".join(names)}' for name, (_, names) in FORMATS.items() if names)
     parser.add_argument('result', metavar='RESULT.xml', type=Path, help='the calibrated DLO')
     parser.add_argument('--format', required=True, choices=tuple(FORMATS), help=(
         'mjcf: MuJoCo 3 and 4; usd: Newton and Isaac Lab; sdf: Gazebo'))
@@ -48,10 +48,10 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
         raise InputError('--form', repr(chosen.form), one_of(forms, chosen.form) if forms else
                          f'no form: {chosen.format} has only one', 'correct it')
     description = read_result(chosen.result)
-    for text in description.problems:
-        print_message(text)
-    known = {name: value for name, value in description.file_options.values.items() if name in USED}
-    options = Options.of({**known, **given_options(chosen)})
+    for warning in description.file_options.warnings:
+        print_message(warning)
+    recorded = {name: value for name, value in description.file_options.values.items() if name in USED}
+    options = Options.of({**recorded, **given_options(chosen)})
     chain = read_chain_file(chosen.start)
     form = {} if chosen.form is None else {'form': chosen.form}
     text = export(description, chain, options=options, **form)

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import argparse
-from contextlib import ExitStack
+from contextlib import closing, ExitStack
 from dataclasses import replace
 from pathlib import Path
 import sys
@@ -21,15 +21,7 @@ from dlo_calibration.cli.validate import validated
 from dlo_calibration.errors import InputError, SimulationError
 from dlo_calibration.files.result import HOW, read_result
 from dlo_calibration.signals import StopFlag
-from dlo_calibration.workspace.folder import (
-    CalibrationFolder,
-    EVALUATIONS,
-    FILES,
-    input_in,
-    REPORT,
-    RESULT,
-    SESSION,
-)
+from dlo_calibration.workspace.folder import CalibrationFolder, EVALUATIONS, FILES, REPORT, RESULT, SESSION
 from dlo_calibration.workspace.source import read_source, Source
 
 
@@ -52,8 +44,8 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
         if chosen.resume is not None:
             if not CalibrationFolder.is_unfinished(chosen.resume):
                 return _finished(chosen, make_simulator)
-            folder = stack.enter_context(CalibrationFolder(chosen.resume))
-            selection = selected(chosen, chosen.session or folder.input)
+            folder = stack.enter_context(closing(CalibrationFolder(chosen.resume)))
+            selection = selected(chosen, chosen.session or CalibrationFolder.input_of(chosen.resume))
             if chosen.session is None:  # the copy of the input has the calibrator's names
                 selection = replace(selection, remap={})
             selection = folder.resume(selection)
@@ -66,7 +58,7 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
         if output is None and 'output_directory' in selection.options:
             output = Path(source.options.output_directory)
         if folder is None and output is not None:
-            folder = stack.enter_context(CalibrationFolder(output))
+            folder = stack.enter_context(closing(CalibrationFolder(output)))
         if folder is not None:
             folder.begin(source, print_message)
         _fit(chosen, source, folder, make_simulator)
@@ -88,7 +80,7 @@ def _fit(chosen: argparse.Namespace, source: Source, folder: CalibrationFolder |
 
     most = choose(source.trials, source.options).options.evaluations
     with StopFlag() as stop:
-        with SearchBar(most, sys.stderr, shown=not chosen.json, known=log.evaluations if log else 0) as bar:
+        with SearchBar(most, sys.stderr, shown=not chosen.json, logged=log.evaluations if log else 0) as bar:
             try:
                 result = calibrate(
                     source.trials, source.options, on_evaluation=bar.take, on_notice=warn_once,
@@ -102,9 +94,10 @@ def _fit(chosen: argparse.Namespace, source: Source, folder: CalibrationFolder |
         stopped = stop()
         try:
             print_result(result, chosen.json, warnings)  # first, as the page takes seconds
-        finally:  # whatever becomes of the output
+        finally:  # even if stdout fails
             if folder is not None:
-                attempts = folder.complete(result, make_simulator, stop, stopped=stopped)
+                attempts = folder.complete(result, make_simulator, stop, stopped=stopped,
+                                           responsive=False)
         if folder is not None:
             attempts.require()
             written = ', '.join(name for name in FILES if name in attempts.written)
@@ -127,8 +120,8 @@ def _finished(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> i
     print_message(f'nothing to resume: the calibration is finished, and its result is {folder / RESULT}')
     if chosen.json:
         file = read_result(folder / RESULT)
-        source = read_source(selected(chosen, chosen.session or input_in(folder)), print_message,
-                             file.file_options).require_trials()
+        path = chosen.session or CalibrationFolder.input_of(folder)
+        source = read_source(selected(chosen, path), print_message, file.file_options).require_trials()
         trials = [trial for trial in source.trials if trial.name in file.trials]
         result = replace(validated(file, trials, source.options, make_simulator),
                          warnings=file.warnings, confirmation=file.confirmation)

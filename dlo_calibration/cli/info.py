@@ -34,18 +34,21 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
 
 def _about(source: Source) -> dict[str, Any]:
     """Return what a session contains, as plain values."""
-    choice = choose(source.trials, source.options)
+    evidence = source.evidence
+    choice, recorded = choose(source.trials, source.options, evidence), source.session.file_options
+    used = {trial.name for trial in evidence.usable(source.trials)}
     return {
         'session': str(source.path), 'duration_s': source.session.duration,
         'frames': list(source.session.frames),
         'messages': dict(sorted(source.session.counts.items())),
         'unknown_topics': [_about_topic(topic, kind, source.session.counts[topic])
                            for topic, kind in source.session.others.items()],
-        'options': source.session.recorded, 'calibrate': list(choice.options.calibrate),
-        'choice': choice.words,
-        'trials': [_about_trial(number, trial)
+        'options': None if recorded is None else dict(recorded.values),
+        'calibrate': list(choice.options.calibrate), 'choice': choice.words,
+        'trials': [{**_about_trial(number, trial), 'used': trial.name in used}
                    for number, trial in zip(source.numbers, source.trials, strict=True)],
-        'refusals': list(source.refusals), 'problems': [*source.session.problems, *source.implausible]}
+        'refusals': list(source.refusals), 'notes': list(source.notes),
+        'problems': [*source.session.warnings, *source.trial_warnings]}
 
 
 def _about_topic(topic: str, kind: str, count: int) -> dict[str, Any]:

@@ -59,7 +59,10 @@ def main(args: Sequence[str] | None = None, make_simulator: SimulatorFactory | N
                              suggestion(words[0], VERBS, f'see {PROGRAM} --help'))
         chosen = _parser(words).parse_args(words)
         from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
+        from dlo_calibration.cli.arguments import options_without_effect
 
+        for flag in options_without_effect(chosen):
+            print_message(f'{flag}: has no effect on {words[0]}')
         return int(chosen.act(chosen, make_simulator or make_chosen_simulator))
     except DloCalibrationError as error:
         print_message(f'{PROGRAM}: {" ".join(str(error).split())}')

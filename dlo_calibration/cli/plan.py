@@ -13,7 +13,7 @@ from pathlib import Path
 import sys
 
 from dlo_calibration.calibration.engines import SimulatorFactory
-from dlo_calibration.calibration.options import Options, SIMULATION
+from dlo_calibration.calibration.options import FileOptions, Options, SIMULATION
 from dlo_calibration.cli.arguments import add_options, given_options
 from dlo_calibration.cli.output import print_json, print_message, print_sentences
 from dlo_calibration.errors import unwritable
@@ -56,9 +56,9 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     options = PlanOptions.of(given_options(chosen, PlanOptions))
     description = read_result(chosen.result)
     of_result = description.file_options
-    for text in of_result.problems:
-        if text != str(of_result.refusal):
-            print_message(text)
+    for warning in of_result.warnings:
+        if warning != str(of_result.refusal):
+            print_message(warning)
     simulation = of_result.options(given_options(chosen))
     start, goal = read_chain_file(chosen.start), read_chain_file(chosen.goal)
     if chosen.output is not None:
@@ -74,7 +74,7 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
                 print_json(plain_plan(made))
             else:
                 print_sentences(plan_sentences(made))
-        finally:  # whatever becomes of the output
+        finally:  # even if stdout fails
             if chosen.output is not None:
                 write_plan_files(chosen.output, made, description, simulation, make_simulator)
                 print_message(f'the plan is in {chosen.output}')
@@ -114,7 +114,7 @@ def plan_request(plan: Plan, description: Description, simulation: Options) -> R
     steps = in_turn([ActionStep(planned.action) for planned in plan.actions])
     options = {name: value for name, value in simulation.flat().items() if name in OF_PLACE}
     return Request((TrialRequest(PLAN, plan.start, tuple(step.action for step in steps), ()),),
-                   {**options, 'mass': description.mass})
+                   FileOptions({**options, 'mass': description.mass}))
 
 
 def _remove_older(folder: Path) -> None:

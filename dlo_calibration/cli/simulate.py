@@ -12,6 +12,8 @@ from pathlib import Path
 import time
 from typing import Any, Mapping, Sequence
 
+import numpy as np
+
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options, SIMULATION
 from dlo_calibration.cli.arguments import (
@@ -27,6 +29,7 @@ from dlo_calibration.files.chain_file import write_chain
 from dlo_calibration.files.result import Description
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.named_actions import Manipulation
+from dlo_calibration.model.parameters import HANDS
 from dlo_calibration.observation.table import resting_level
 from dlo_calibration.planning.prediction import DRAWS, plain_prediction, Prediction, simulate
 from dlo_calibration.planning.rehearsal import motion_of_actions
@@ -37,7 +40,7 @@ from dlo_calibration.writing import Attempts, make_folder, whole
 ALL = 'simulation.json'  # file with all predictions
 MOST_DRAWS = 10_000
 Named = Sequence[tuple[str, Prediction]]  # names of trials, which can be anything, and what happens there
-USED = (*SIMULATION, 'grip_tolerance', 'length_tolerance', 'release')  # options
+USED = (*SIMULATION, 'workers', 'frame_pose', 'grip_tolerance', 'length_tolerance', 'release')  # options
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -68,6 +71,9 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
             raise InputError(f'--{name}', str(getattr(chosen, name)), f'{least} to {most}', 'correct it')
     description = read_result_file(chosen)
     manipulations, options = read_manipulations(selected(chosen), print_message, description.file_options)
+    shift = np.array([description.physical().get(name, 0.0) for name in HANDS[1:]])
+    if shift.any():  # the hands of the session have the error that the calibration has found
+        manipulations = tuple(manipulation.with_shifted_hands(shift) for manipulation in manipulations)
     if chosen.output is not None:
         make_folder(chosen.output)  # before the simulations
     begun = time.monotonic()
@@ -132,8 +138,8 @@ def _show(predictions: Named, options: Options, simulator: Simulator) -> None:
             frame_rate=FRAME_RATE, most=MOST_FRAMES)
         films.append(Film.of(name, trial, motion, hand_colours([trial]), radius))
         levels.append(resting_level(trial, options.table_height))
-    known = [level - radius for level in levels if level is not None]
-    show(films, radius, min(known, default=options.table_height) if options.table else None, options.scene,
+    heights = [level - radius for level in levels if level is not None]
+    show(films, radius, min(heights, default=options.table_height) if options.table else None, options.scene,
          lambda: print_message('close the window, or press Ctrl-C, to end'))
 
 
@@ -146,10 +152,7 @@ def write_prediction_files(folder: Path, predictions: Sequence[tuple[str, Predic
     :param about: the same, as plain values.
     :raises DloCalibrationError: if files cannot be written; the others are.
     """
-    from dlo_calibration.report.plan_drawing import (
-        write_prediction_animation,
-        write_prediction_picture,
-    )
+    from dlo_calibration.report.plan_drawing import write_prediction_animation, write_prediction_picture
 
     attempts = Attempts(folder)
     with attempts.attempt(ALL), whole(folder / ALL) as new:

@@ -18,7 +18,7 @@ from dlo_calibration.files.chain_file import write_chain
 from dlo_calibration.model.chain import MOST_POINTS
 from dlo_calibration.vision.axis import axis_of, measured_diameter
 from dlo_calibration.vision.board import find_board
-from dlo_calibration.vision.camera import read_lens
+from dlo_calibration.vision.lens import read_lens
 from dlo_calibration.vision.photograph import Photograph, read_photograph
 from dlo_calibration.vision.pose import scale_from_points
 from dlo_calibration.vision.scale import Scale
@@ -76,7 +76,7 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
                     'crossings': [list(crossing.pixel) for crossing in trace.crossings],
                     'sure': trace.sure.tolist(),
                     'residual_m': None if scale is None else scale.residual,
-                    'notes': [] if scale is None else list(scale.notes), 'seconds': seconds})
+                    'notes': [] if scale is None else list(scale.warnings), 'seconds': seconds})
     else:
         _print(trace, scale, length, diameter)
     return 0
@@ -132,5 +132,5 @@ def _print(trace: Trace, scale: Scale | None, length: float | None, diameter: fl
             return
         stream.write(f'DLO {1000 * length:.1f} mm long, {1000 * diameter:.1f} mm thick; '
                      f'scale within {1000 * scale.residual:.2f} mm\n')
-        for note in scale.notes:
-            stream.write(f'{note}\n')
+        for warning in scale.warnings:
+            stream.write(f'{warning}\n')

@@ -62,8 +62,8 @@ def validated(file: Description, trials: Sequence[Trial], options: Options,
     warnings = (*implausible, *(f'never came to rest: {name}; the last state was compared'
                            for name in evaluation.unsettled))
     return CalibrationResult(
-        space=file.space, parameters=file.parameters, best=evaluation, trials=trials,
+        space=file.space, estimates=file.parameters, best=evaluation, trials=trials,
         chains=simulated_chains(trials, evaluation), evaluations=(evaluation,),
         seconds=seconds, search=file.search, engine=simulator.name,
         stop_reason='validation: nothing was fitted', seed=file.seed, warnings=warnings,
-        implausible=implausible)
+        implausible=implausible, unusable_fit=file.unusable)

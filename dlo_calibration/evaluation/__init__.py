@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Parameter sets evaluated on all trials, on threads, in PyBullet's process or on a cluster; residuals."""
+"""Evaluate parameter sets on all trials: on threads, in a process for PyBullet or on a cluster; residuals."""
 
 from dlo_calibration.evaluation.batch import BatchEvaluator
 from dlo_calibration.evaluation.cluster import ClusterExecutor

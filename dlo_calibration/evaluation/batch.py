@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""BatchEvaluator: evaluates batches of points in parallel, and yields the results in order."""
+"""BatchEvaluator: evaluates batches of points in parallel and yields the evaluations in order."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class BatchEvaluator:
 
     Once the pool stops, a batch ends early, without an error.
 
-    :param pool: simulates, with the evaluator's simulator.
-    :param memory: holds earlier evaluations, which are not simulated again, and stores each new one as soon
-        as it is finished; None: nothing is stored.
+    :param pool: simulates with the evaluator's simulator.
+    :param memory: holds earlier evaluations, which are not simulated again, and stores each new evaluation
+        when it is finished; None: nothing is stored.
     """
 
     def __init__(self, evaluator: Evaluator, pool: Pool, memory: EvaluatorMemory | None = None) -> None:
@@ -39,21 +39,21 @@ class BatchEvaluator:
 
         The first one has the index `first`.
         """
-        known = [self._memory.find(index, point) for index, point in enumerate(points, first)]
-        new = [k for k, evaluation in enumerate(known) if evaluation is None]
+        stored = [self._memory.find(index, point) for index, point in enumerate(points, first)]
+        new = [k for k, evaluation in enumerate(stored) if evaluation is None]
         trials = len(self.evaluator.trials)
         size = max(1, self._pool.portion(len(new) * trials) // trials)
-        futures: dict[int, tuple[Future[list[Evaluation]], int]] = {}  # and the place in its result
+        futures: dict[int, tuple[Future[list[Evaluation]], int]] = {}  # each with a place in its result
         for begin in range(0, len(new), size):
             portion = [(first + k, points[k]) for k in new[begin:begin + size]]
             jobs = [job for _, point in portion for job in self.evaluator.jobs(point)]
             future = self._pool.submit(jobs, partial(self._evaluated, portion))
             futures.update({k: (future, place) for place, k in enumerate(new[begin:begin + size])})
-        return self._in_order(known, futures)
+        return self._in_order(stored, futures)
 
     def _evaluated(self, points: Sequence[tuple[int, Floats]],
                    rollouts: Sequence[Rollout | SimulationError]) -> list[Evaluation]:
-        """Return the evaluations of points, each with its index, and remember them."""
+        """Return the evaluations of points with their indices, and store them."""
         trials, evaluations = len(self.evaluator.trials), []
         for k, (index, point) in enumerate(points):
             evaluations.append(
@@ -61,12 +61,12 @@ class BatchEvaluator:
             self._memory.add(evaluations[-1])
         return evaluations
 
-    def _in_order(self, known: Sequence[Evaluation | None],
+    def _in_order(self, stored: Sequence[Evaluation | None],
                   futures: Mapping[int, tuple[Future[list[Evaluation]], int]]) -> Iterator[Evaluation]:
-        """Yield the known evaluations, and those of the futures in place of each None."""
-        finished: Future[list[Evaluation]] = Future()  # so that the pool may also stop at a known one
+        """Yield the stored evaluations, and those of the futures in place of each None."""
+        finished: Future[list[Evaluation]] = Future()  # so that the pool can also stop at a stored one
         finished.set_result([])
-        for k, evaluation in enumerate(known):
+        for k, evaluation in enumerate(stored):
             future, place = futures.get(k, (finished, 0))
             try:
                 evaluations = self._pool.result(future)
@@ -86,10 +86,10 @@ class BatchEvaluator:
         """Begin to evaluate (k, d) points; return a function that waits for their `residuals`."""
         under_way = self(points, 0)
 
-        def ended() -> Sequence[Floats | None]:
+        def result() -> Sequence[Floats | None]:
             residuals = [evaluation.residuals for evaluation in under_way]
             if len(residuals) < len(points):
                 raise CancelledError
             return residuals
 
-        return ended
+        return result

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""ClusterExecutor: evaluations on the workers of a Dask scheduler, on any number of machines."""
+"""ClusterExecutor: simulates on the workers of a Dask scheduler, on any number of machines."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from dlo_calibration.model.trial import Trial
 from dlo_calibration.simulation.protocol import Simulator, Stop
 
 PATIENCE = 8  # s after which a scheduler counts as unreachable
-RETURN = 30.0  # s that we wait for a worker after the last one was lost
-MOST_KEPT = 1000  # trials and simulators that a worker keeps
+RETURN = 30.0  # s to wait for a new worker after the last one is lost
+CACHE_SIZE = 1000  # trials and simulators in the cache of a worker
 
 
 class ClusterExecutor(Executor):
     """
     An executor on the workers of a Dask scheduler.
 
-    This package must be installed where the workers are; the scheduler's machine needs only Dask.
+    Each worker's machine needs this package; the scheduler's machine needs only Dask.
 
     :param address: of the scheduler, e.g. ``tcp://host:8786``.
-    :param on_loss: called with a sentence for each lost worker, from any thread.
+    :param on_loss: called with a warning for each lost worker, from any thread.
     :param on_wait: called with a sentence if there is no worker yet.
     :raises InputError: if Dask is not installed or no scheduler answers.
     """
@@ -54,8 +54,8 @@ class ClusterExecutor(Executor):
         self._pending: dict[Future[Any], Future[Any]] = {}  # future without a result -> Dask's future
         self._given_up: BaseException | None = None
         self._deadline = float('inf')  # [s] by which there must be a worker
-        self._kept: dict[int, tuple[Any, str, bytes]] = {}  # trials and simulators, as workers keep them
-        self._silence = _Silence()
+        self._pickled: dict[int, tuple[Any, str, bytes]] = {}  # trials and simulators with key and pickle
+        self._restore_logging = _mute_dask()
         try:
             # Try the address first: Dask's client retries for long, and logs an error when it is deleted.
             socket.create_connection(get_address_host_port(address, strict=True), PATIENCE).close()
@@ -63,7 +63,7 @@ class ClusterExecutor(Executor):
                 warnings.simplefilter('ignore')  # e.g. about versions of the workers; failures are reported
                 self._client = Client(address, timeout=PATIENCE, set_as_default=False)
         except (OSError, ValueError, TypeError, ImportError) as error:
-            self._silence.end()
+            self._restore_logging()
             raise InputError('parameter scheduler', f'{address!r} ({" ".join(str(error).split())})',
                              'the address of a Dask scheduler that answers, such as tcp://host:8786',
                              'start one with: dask scheduler') from error
@@ -80,25 +80,25 @@ class ClusterExecutor(Executor):
         Return a future that may be cancelled at any time.
 
         Trials and simulators are pickled once, and each worker unpickles them once: with thousands of
-        chains, that takes as long as simulating the trials.
+        chains, pickling takes as long as simulating the trials.
         """
         future: Future[Any] = Future()
-        # Send bytes and a function of Python's library: any worker and the scheduler can unpickle these.  A
+        # Send bytes and a function of Python's library: every worker and the scheduler can unpickle these.  A
         # worker that fails to unpickle a task, e.g. because a module is missing, leaves without an error.
-        self._send(future, _packed(_Call(call, *args, **keywords), self._kept))
+        self._send(future, _pickled(_Call(call, *args, **keywords), self._pickled))
         if self._given_up is not None:
             self._fail(future, self._given_up)
         return future
 
-    def _send(self, future: Future[Any], packed: bytes) -> None:
-        """Let a worker unpickle a call, which makes it, and give its result to a future."""
-        there = self._executor.submit(pickle.loads, packed)  # noqa: S301  # a worker unpickles it
-        self._pending[future] = there
-        future.add_done_callback(lambda done: there.cancel() if done.cancelled() else None)
-        there.add_done_callback(lambda _: self._pass_on(future, packed))
+    def _send(self, future: Future[Any], pickled: bytes) -> None:
+        """Let a worker unpickle a call, which executes it; its result becomes that of a future."""
+        remote = self._executor.submit(pickle.loads, pickled)  # noqa: S301  # a worker unpickles it
+        self._pending[future] = remote
+        future.add_done_callback(lambda done: remote.cancel() if done.cancelled() else None)
+        remote.add_done_callback(lambda _: self._finish(future, pickled))
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End when all submitted calls are done; at once if they are cancelled or need not be waited for."""
+        """Disconnect when all submitted calls are done; at once without `wait` or with `cancel_futures`."""
         if not self._closed.is_set():
             self._executor.shutdown(wait=wait and not cancel_futures)
             self.close()
@@ -108,32 +108,32 @@ class ClusterExecutor(Executor):
         if self._closed.is_set():
             return
         self._closed.set()
-        leaving = threading.Thread(target=self._leave, name='leaving a scheduler', daemon=True)
-        leaving.start()
-        leaving.join(2.0)  # s; a scheduler that does not answer must not delay the end
+        thread = threading.Thread(target=self._disconnect, name='leaving a scheduler', daemon=True)
+        thread.start()
+        thread.join(2.0)  # s; a scheduler that does not answer must not delay the end
 
-    def _leave(self) -> None:
+    def _disconnect(self) -> None:
         try:
             self._executor.shutdown(wait=False)
             self._client.close(timeout=PATIENCE)
         except Exception as error:  # the scheduler is gone, and the submitted calls with it
             logging.getLogger(__name__).debug('leaving a scheduler: %r', error)
         finally:
-            self._silence.end()
+            self._restore_logging()
 
-    def _pass_on(self, future: Future[Any], packed: bytes) -> None:
+    def _finish(self, future: Future[Any], pickled: bytes) -> None:
         """Give a future its result, or an error that says what to do; send the call again if Dask lost it."""
         done = self._pending.get(future)
         if done is None:
             return
         error = CancelledError() if done.cancelled() else done.exception()
-        if _mistaken(error):
-            self._send(future, packed)
+        if _is_misread_result(error):
+            self._send(future, pickled)
         elif error is not None:
             reason = CancelledError() if self._closed.is_set() else self._explained(error)
             self._fail(future, reason)
             if reason is not error and not self._closed.is_set():
-                self._give_up(reason)  # other futures might never end, e.g. if all workers were killed
+                self._give_up(reason)  # the other futures may never end, e.g. if all workers were killed
         elif self._pending.pop(future, None) and future.set_running_or_notify_cancel():
             future.set_result(done.result())
 
@@ -143,7 +143,7 @@ class ClusterExecutor(Executor):
             future.set_exception(error)
 
     def _explained(self, error: BaseException) -> BaseException:
-        """Return an error that says what to do in place of one of Dask; any other as it is."""
+        """Return an error that says what to do if the error is one of Dask's; else the error itself."""
         from distributed import KilledWorker
 
         if isinstance(error, KilledWorker):
@@ -168,7 +168,7 @@ class ClusterExecutor(Executor):
                                    'see its log, and start again')
 
     def _hear(self, event: tuple[float, Mapping[str, Any]]) -> None:
-        """React to an event of the scheduler."""
+        """Receive an event of the scheduler."""
         _, content = event
         if content.get('action') == 'remove-worker' and not self._closed.is_set():
             self._on_loss(f'the scheduler lost the worker {content.get("worker")}; what it did is repeated')
@@ -199,45 +199,46 @@ class ClusterExecutor(Executor):
 
 
 class _Call(partial[Any]):
-    """A call that is executed by unpickling it."""
+    """A call that unpickling executes."""
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
         return partial(self.func, **self.keywords), self.args
 
 
-def _packed(call: _Call, kept: dict[int, tuple[Any, str, bytes]]) -> bytes:
-    """Pickle a call, with trials and simulators as workers keep them, and without what stops it here."""
+def _pickled(call: _Call, pickled: dict[int, tuple[Any, str, bytes]]) -> bytes:
+    """Pickle a call: trials and simulators by key, for the cache of workers, and each `Stop` as a new one."""
     class Pickler(pickle.Pickler):
-        def reducer_override(self, one: Any) -> Any:
-            if isinstance(one, Stop):
+        def reducer_override(self, content: Any) -> Any:
+            if isinstance(content, Stop):
                 return Stop, ()
-            if not isinstance(one, (Trial, Simulator)):
+            if not isinstance(content, (Trial, Simulator)):
                 return NotImplemented
-            if id(one) not in kept:
-                kept[id(one)] = one, uuid.uuid4().hex, pickle.dumps(one, pickle.HIGHEST_PROTOCOL)
-            return _unpacked, kept[id(one)][1:]
+            if id(content) not in pickled:
+                pickled[id(content)] = (
+                    content, uuid.uuid4().hex, pickle.dumps(content, pickle.HIGHEST_PROTOCOL))
+            return _unpickled, pickled[id(content)][1:]
 
     stream = io.BytesIO()
     Pickler(stream, pickle.HIGHEST_PROTOCOL).dump(call)
     return stream.getvalue()
 
 
-_here: dict[str, Any] = {}  # what this worker has unpacked
+_cache: dict[str, Any] = {}  # of this worker, by key
 
 
-def _unpacked(key: str, packed: bytes) -> Any:
-    if key not in _here:
-        while len(_here) >= MOST_KEPT:
-            del _here[next(iter(_here))]
-        _here[key] = pickle.loads(packed)  # noqa: S301  # sent by whoever calibrates
-    return _here[key]
+def _unpickled(key: str, pickled: bytes) -> Any:
+    if key not in _cache:
+        while len(_cache) >= CACHE_SIZE:
+            del _cache[next(iter(_cache))]
+        _cache[key] = pickle.loads(pickled)  # noqa: S301  # sent by the calibrating process
+    return _cache[key]
 
 
-def _mistaken(error: BaseException | None) -> bool:
+def _is_misread_result(error: BaseException | None) -> bool:
     """
-    Tell whether Dask took a result for an error.
+    Return whether Dask misread a result as an error.
 
-    It reads the status of a call after its result has arrived. If the worker is lost in between, Dask
+    Dask reads the status of a call after its result has arrived. If the worker is lost in between, Dask
     unpacks the result as if it were type, exception and traceback (`_cascade_future` of its cfexecutor).
     """
     frames = traceback.extract_tb(error.__traceback__) if isinstance(error, TypeError) else []
@@ -245,7 +246,7 @@ def _mistaken(error: BaseException | None) -> bool:
 
 
 def _missing_module(error: BaseException | None) -> str:
-    """Return the name of the missing module that caused an error; empty if there is none."""
+    """Return the name of the missing module that caused an error, or ''."""
     while error is not None:
         if isinstance(error, ModuleNotFoundError):
             return error.name or str(error)
@@ -253,15 +254,15 @@ def _missing_module(error: BaseException | None) -> str:
     return ''
 
 
-class _Silence:
-    """Keeps Dask from writing to stderr until `end`: the progress bar is there."""
+def _mute_dask() -> Callable[[], None]:
+    """Keep Dask from logging to stderr, where the progress bar is; return a function that undoes this."""
+    names = ('distributed', 'distributed.client', 'tornado.application', 'asyncio')
+    levels = {logger: logger.level for logger in map(logging.getLogger, names)}
+    for logger in levels:
+        logger.setLevel(logging.CRITICAL + 1)
 
-    def __init__(self) -> None:
-        names = ('distributed', 'distributed.client', 'tornado.application', 'asyncio')
-        self._before = {name: logging.getLogger(name).level for name in names}
-        for name in names:
-            logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+    def restore() -> None:
+        for logger, level in levels.items():
+            logger.setLevel(level)
 
-    def end(self) -> None:
-        for name, level in self._before.items():
-            logging.getLogger(name).setLevel(level)
+    return restore

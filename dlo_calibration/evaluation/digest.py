@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Digests: of values, by which evaluations and calibrations are recognised; of source code; of files."""
+"""Digests of values, which identify evaluations and calibrations, of source code and of files."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping  # that of typing makes isinstance ten times slower
+from collections.abc import Mapping  # with typing.Mapping, isinstance is ten times slower
 from dataclasses import fields, is_dataclass
 import functools
 from hashlib import blake2b, file_digest
@@ -17,20 +17,20 @@ import numpy as np
 from dlo_calibration.simulation.core import _core
 
 
-def digest(*things: Any) -> str:
+def digest(*values: Any) -> str:
     """
-    Return a digest of values, arrays and dataclasses that is the same in any process and on any machine.
+    Return a digest of values, arrays and dataclasses; it is the same in every process and on every machine.
 
-    :raises TypeError: for a thing of another type.
+    :raises TypeError: for any other type.
     """
     state = blake2b(digest_size=16)
-    _feed(state, things)
+    _feed(state, values)
     return state.hexdigest()
 
 
 @functools.cache
 def code_digest(rooms: tuple[str, ...]) -> str:
-    """Return a digest of the Python code of rooms of this package, and of the compiled core."""
+    """Return a digest of the Python code of some rooms of this package, and of the compiled core."""
     package = Path(__file__).parents[1]
     files = [file for room in rooms for file in sorted((package / room).glob('*.py'))]
     return digest(*(file.read_bytes() for file in (*files, Path(_core.__file__))))
@@ -38,7 +38,7 @@ def code_digest(rooms: tuple[str, ...]) -> str:
 
 def file_digests(paths: Iterable[Path]) -> dict[str, str]:
     """
-    Return the SHA-256 of files, which `sha256sum` prints, too, by their name without folders.
+    Return the SHA-256 of files, as `sha256sum` prints it, by file name without folders.
 
     :raises OSError: if a file cannot be read.
     """
@@ -49,30 +49,30 @@ def file_digests(paths: Iterable[Path]) -> dict[str, str]:
     return digests
 
 
-def _feed(state: Any, thing: Any) -> None:
-    """Feed a thing to a hash: its type, its length, and its content."""
-    if isinstance(thing, np.generic):
-        thing = thing.item()
-    if thing is None or isinstance(thing, (bool, int, float, str, bytes)):  # most things, so they come first
-        kind = thing.hex() if isinstance(thing, float) else thing
-        octets = thing if isinstance(thing, bytes) else str(kind).encode('utf-8', 'surrogatepass')
-        state.update(f'{type(thing).__name__}{len(octets)}:'.encode() + octets)
-    elif is_dataclass(thing) and not isinstance(thing, type):
-        name = type(thing).__name__
-        _feed(state, {f'{name}.{one.name}': getattr(thing, one.name) for one in fields(thing)})
-    elif isinstance(thing, np.ndarray):
-        thing = np.ascontiguousarray(thing, thing.dtype.newbyteorder('<'))
-        if thing.dtype.hasobject:
+def _feed(state: Any, value: Any) -> None:
+    """Feed a value to a hash: its type, length and content."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    if value is None or isinstance(value, (bool, int, float, str, bytes)):  # first, as most values are these
+        text = value.hex() if isinstance(value, float) else value
+        octets = text if isinstance(text, bytes) else str(text).encode('utf-8', 'surrogatepass')
+        state.update(f'{type(value).__name__}{len(octets)}:'.encode() + octets)
+    elif is_dataclass(value) and not isinstance(value, type):
+        name = type(value).__name__
+        _feed(state, {f'{name}.{field.name}': getattr(value, field.name) for field in fields(value)})
+    elif isinstance(value, np.ndarray):
+        value = np.ascontiguousarray(value, value.dtype.newbyteorder('<'))
+        if value.dtype.hasobject:
             raise TypeError('an array of objects has no digest')
-        _feed(state, (thing.dtype.str, thing.shape))
-        state.update(thing.tobytes())
-    elif isinstance(thing, Mapping):
-        state.update(f'{{{len(thing)}:'.encode())
-        for name in sorted(thing):
-            _feed(state, (name, thing[name]))
-    elif isinstance(thing, (tuple, list)):
-        state.update(f'({len(thing)}:'.encode())
-        for one in thing:
-            _feed(state, one)
+        _feed(state, (value.dtype.str, value.shape))
+        state.update(value.tobytes())
+    elif isinstance(value, Mapping):
+        state.update(f'{{{len(value)}:'.encode())
+        for name in sorted(value):
+            _feed(state, (name, value[name]))
+    elif isinstance(value, (tuple, list)):
+        state.update(f'({len(value)}:'.encode())
+        for item in value:
+            _feed(state, item)
     else:
-        raise TypeError(f'a {type(thing).__name__} has no digest')
+        raise TypeError(f'a {type(value).__name__} has no digest')

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Mapping, Sequence
 
 import numpy as np
@@ -15,7 +15,7 @@ import numpy as np
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.evaluation.residuals import compared_rows, ResidualLayout
 from dlo_calibration.model.chain import Floats, frozen_array
-from dlo_calibration.model.parameters import ParameterSpace
+from dlo_calibration.model.parameters import HANDS, ParameterSpace
 from dlo_calibration.model.score import PointErrors, residuals, TrialScore
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.simulation.protocol import Job, Rollout, simulate_all, Simulator, Stop
@@ -58,12 +58,24 @@ def mean_length(trials: Sequence[Trial]) -> float:
     return float(np.mean([trial.initial.length for trial in trials]))
 
 
+def with_hands(trial: Trial, physical: Mapping[str, float]) -> Trial:
+    """
+    Return a trial with the hands where and when they really were.
+
+    :param physical: parameters by name (SI units), of which those in HANDS are used.
+    """
+    late, *shift = (physical.get(name, 0.0) for name in HANDS)
+    if any(shift):
+        trial = trial.with_shifted_hands(np.array(shift))
+    return trial.with_late_hands(late) if late else trial
+
+
 class Evaluator:
     """
     Tries parameter sets on trials.
 
-    :param every_goal: whether its residuals are those of every goal; if not, they are those of the
-        `compared_goals`. Scores and errors are always those of every goal.
+    :param every_goal: whether residuals are those of every goal, or only those of the `compared_goals`.
+        Scores and errors are always those of every goal.
     """
 
     def __init__(self, trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator,
@@ -74,16 +86,18 @@ class Evaluator:
         self._rows = None if every_goal else compared_rows(trials)
         self._length = mean_length(trials)
         self._scores = tuple(TrialScore(trial) for trial in trials)
+        # Most points that are tried together have the same errors of the hands.
+        self._with_hands = lru_cache(maxsize=16)(self._trials_with_hands)
 
     def of(self, space: ParameterSpace) -> Evaluator:
         """Return an evaluator with other parameters."""
-        other = copy.copy(self)  # what belongs to the trials never changes
+        other = copy.copy(self)  # shares what depends on the trials alone
         other.space = space
         return other
 
     @property
     def layout(self) -> ResidualLayout:
-        """The order of its residuals."""
+        """The layout of the residuals."""
         return ResidualLayout.of(self.trials) if self._rows is None else ResidualLayout.compared(self.trials)
 
     def evaluate(self, index: int, point: Floats) -> Evaluation:
@@ -91,9 +105,14 @@ class Evaluator:
         return self.evaluated(index, point, simulate_all(self.simulator, self.jobs(point), Stop()))
 
     def jobs(self, point: Floats) -> list[Job]:
-        """Return what is simulated at a (d,) point of the unit cube: each trial."""
+        """Return the jobs of a (d,) point of the unit cube, one for each trial."""
         physical = self.space.physical(self.space.values(point), self._length)
-        return [(trial, physical) for trial in self.trials]
+        errors = tuple(physical.get(name, 0.0) for name in HANDS)
+        return [(trial, physical) for trial in self._with_hands(errors)]
+
+    def _trials_with_hands(self, errors: tuple[float, ...]) -> tuple[Trial, ...]:
+        named = dict(zip(HANDS, errors, strict=True))
+        return tuple(with_hands(trial, named) for trial in self.trials)
 
     def evaluated(self, index: int, point: Floats, outcomes: Sequence[Rollout | SimulationError]
                   ) -> Evaluation:
@@ -112,5 +131,5 @@ class Evaluator:
                             if not all(rollout.settled)))
         residual = np.concatenate([residuals(trial, rollout.chains)
                                    for trial, rollout in zip(self.trials, rollouts, strict=True)])
-        kept = residual if self._rows is None else residual[self._rows]
-        return replace(evaluation, errors=PointErrors.of(residual), residuals=frozen_array(kept))
+        compared = residual if self._rows is None else residual[self._rows]
+        return replace(evaluation, errors=PointErrors.of(residual), residuals=frozen_array(compared))

@@ -17,11 +17,11 @@ from dlo_calibration.model.chain import Floats
 
 # Steps of finite differences, in the unit cube:
 STEP = 0.03  # usual; over shorter ones, contacts that come and go dominate the residuals
-WIDEST = 0.25  # largest, for parameters that are hardly known; the linear model holds no further
+WIDEST = 0.25  # largest, for parameters of large uncertainty; beyond it, the linear model does not hold
 TINY = float(np.finfo(float).tiny)  # keeps a divisor above zero
 
-Rows = Union[slice, NDArray[np.intp]]  # of a Jacobian: a trial's, or those of several trials
-Columns = Union[Sequence[int], NDArray[np.intp]]  # of a Jacobian, by their indices
+Rows = Union[slice, NDArray[np.intp]]  # of a Jacobian: those of one or several trials
+Columns = Union[Sequence[int], NDArray[np.intp]]  # of a Jacobian: indices
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Linearisation:
 
     @property
     def ridge(self) -> Floats:
-        """A very weak (d, d) prior information, which keeps a parameter without effect where it is."""
+        """A very weak (d, d) prior information, so that a parameter without effect keeps its value."""
         return np.eye(len(self.point)) * max(1e-9 * float(np.trace(self.information)), TINY)
 
     def weighted(self, weights: Floats) -> Linearisation:
@@ -58,7 +58,7 @@ class Linearisation:
         return Linearisation(self.point, weights * self.residuals, weights[:, None] * self.jacobian)
 
     def rows(self, rows: Rows) -> Linearisation:
-        """Return the model of some of the residuals."""
+        """Return the model of the residuals in some rows."""
         return Linearisation(self.point, self.residuals[rows], self.jacobian[rows])
 
     def columns(self, columns: NDArray[np.intp] | NDArray[np.bool_]) -> Linearisation:
@@ -70,21 +70,21 @@ class Linearisation:
         return np.asarray(self.residuals + self.jacobian @ step)
 
     def at(self, point: Floats) -> Linearisation:
-        """Return the model around another (d,) point, as this one predicts it."""
+        """Return the model around another (d,) point, with the residuals that this model predicts there."""
         return Linearisation(point, self.predicted(point - self.point), self.jacobian)
 
     def step(self, prior: Floats | None = None) -> Floats:
         """
         Return the (d,) Gauss-Newton step to the least sum of squared residuals.
 
-        :param prior: (d, d) prior information that is added; None: no prior.
+        :param prior: (d, d) prior information, added to that of the residuals; None: no prior.
         """
         if prior is None:
             return np.asarray(np.linalg.lstsq(self.jacobian, -self.residuals, rcond=None)[0])
         return np.asarray(-np.linalg.solve(self.information + prior, self.gradient))
 
     def own_weights(self, k: int) -> Floats:
-        """Return (m,) weights that turn a change of the residuals into the change of parameter k alone."""
+        """Return (m,) weights whose product with a change of the residuals is the change of parameter k."""
         own = perpendicular(np.delete(self.jacobian, k, axis=1), self.jacobian[:, k])
         return np.asarray(own / max(float(own @ own), TINY))
 
@@ -94,9 +94,9 @@ def information(jacobian: Floats, scale: float = 1.0) -> Floats:
     return np.asarray(jacobian.T @ jacobian / scale**2)
 
 
-def standard_deviations(known: Floats) -> Floats:
-    """Return the (d,) standard deviations of the posterior with a (d, d) information."""
-    return np.sqrt(np.diag(np.linalg.inv(known)))
+def standard_deviations(posterior: Floats) -> Floats:
+    """Return the (d,) standard deviations of a posterior, given its (d, d) information."""
+    return np.sqrt(np.diag(np.linalg.inv(posterior)))
 
 
 def perpendicular(columns: Floats, vector: Floats) -> Floats:
@@ -111,7 +111,7 @@ def broyden(jacobian: Floats, step: Floats, surprise: Floats) -> Floats:
 
     Nocedal and Wright, Numerical Optimization, 2nd ed., 11.1.
 
-    :param surprise: (m,) by how much the residuals after the step differ from those it predicted [m].
+    :param surprise: (m,) [m] observed minus predicted residuals after the step.
     """
     return np.asarray(jacobian + np.outer(surprise, step / (step @ step)))
 
@@ -119,11 +119,11 @@ def broyden(jacobian: Floats, step: Floats, surprise: Floats) -> Floats:
 @dataclass(frozen=True)
 class Differences:
     """
-    Finite differences near a point: the points to evaluate, and the derivatives that they give.
+    Finite differences near a point: the points to evaluate, and the derivatives from their residuals.
 
     :param point: (d,).
     :param columns: indices of the k parameters that are varied.
-    :param beside: for each of them, (p, d) points that differ from `point` in it alone.
+    :param beside: for each of them, (p, d) points that differ from `point` in this parameter only.
     """
 
     point: Floats
@@ -132,14 +132,14 @@ class Differences:
 
     @classmethod
     def one_sided(cls, point: Floats, columns: Columns, steps: Floats) -> Differences:
-        """Return those with one point for each of k parameters, at its signed one of (d,) steps."""
+        """Return one-sided differences: one point for each of k parameters, at its signed step of (d,)."""
         beside = np.tile(point, (len(columns), 1))
         beside[np.arange(len(columns)), columns] += steps[columns]
         return cls(point, columns, [row[None] for row in beside])
 
     @classmethod
     def central(cls, point: Floats, columns: Columns, steps: Floats) -> Differences:
-        """Return those with a point below and one above in each of k parameters, within the unit cube."""
+        """Return central differences: two points for each of k parameters, within the unit cube."""
         pairs = []
         for k in columns:
             pairs.append(np.stack([point, point]))
@@ -148,26 +148,27 @@ class Differences:
 
     @property
     def points(self) -> Floats:
-        """The (n, d) points to evaluate, those of each parameter in turn."""
+        """The (n, d) points to evaluate, parameter by parameter."""
         return np.concatenate([np.zeros((0, len(self.point))), *self.beside])
 
     def jacobian(self, before: Floats, residuals: Iterable[Floats | None], here: Floats | None = None
                  ) -> Floats:
         """
-        Return an (m, d) Jacobian with the columns that the differences give, and the others of `before`.
+        Return the (m, d) Jacobian `before` with the columns of the varied parameters replaced.
 
-        A column is the difference quotient between the smallest and the largest value of its parameter.
+        A column is the difference quotient between the smallest and the largest value of its parameter; it is
+        that of `before` if there are not two values.
 
         :param residuals: the (m,) residuals at each of `points`; None where the simulation failed.
-        :param here: (m,) those at `point`, which stand in for a failed side; None: they are not used.
+        :param here: the (m,) residuals at `point`, which replace those of a failed side; None: unused.
         """
-        jacobian, each = before.copy(), iter(residuals)
+        jacobian, remaining = before.copy(), iter(residuals)
         for k, beside in zip(self.columns, self.beside, strict=True):
             values = (self.point[k], *beside[:, k])
-            known = [(value, seen) for value, seen in zip(
-                values, (here, *islice(each, len(beside))), strict=True) if seen is not None]
-            low, at_low = min(known, key=itemgetter(0), default=(0.0, np.nan))
-            high, at_high = max(known, key=itemgetter(0), default=(0.0, np.nan))
+            samples = [(value, sample) for value, sample in zip(
+                values, (here, *islice(remaining, len(beside))), strict=True) if sample is not None]
+            low, at_low = min(samples, key=itemgetter(0), default=(0.0, np.nan))
+            high, at_high = max(samples, key=itemgetter(0), default=(0.0, np.nan))
             if high > low:
                 jacobian[:, k] = (at_high - at_low) / (high - low)
         return jacobian

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-EvaluationLog: a file with everything that was simulated; Memory: does not simulate that again.
+EvaluationLog: a file with all results of simulations; Memory: finds these, so that none is repeated.
 
-A calibration that was killed goes on from there.
+A calibration that was killed resumes from its log.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from dlo_calibration.model.score import PointErrors
 from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.simulation.protocol import Job, Rollout
 
-LONGEST = 2**25  # bytes of a line: 3 million residuals; reading a line must not take all memory
+LONGEST = 2**25  # bytes of a line: 3 million residuals; a stranger's line must not take all memory
 MOST = 1000000  # entries; a stranger's file must not take all memory, and `evaluations` allows no more
-#: Kinds of entries: an evaluation, a rollout, and the calibration to which all of them belong.
+#: Kinds of entries: an evaluation, a rollout, and the calibration to which these belong.
 EVALUATION, ROLLOUT, CALIBRATION = 'evaluation', 'rollout', 'calibration'
 ERRORS = len(fields(PointErrors))
 
@@ -41,7 +41,7 @@ ERRORS = len(fields(PointErrors))
 @dataclass(frozen=True)
 class Entry:
     """
-    What an entry of a log holds.
+    The content of an entry of a log.
 
     :param numbers: (k,) finite.
     """
@@ -54,9 +54,9 @@ class EvaluationLog:
     """
     A file to which each finished evaluation is appended, one line each.
 
-    A line has a key, numbers, a text and a check sum. A line that is cut or damaged is ignored, as a
-    killed process or a bad disk may leave it. A written line survives any end of the process, but not
-    a power failure before the operating system has written it to disk.
+    A line has a key, numbers, a text and a check sum. A cut or damaged line, e.g. of a killed process or a
+    bad disk, is ignored. A written line survives any end of the process, but not a power failure before the
+    operating system has written it to disk.
 
     Only one process can have a log open. It is not thread-safe.
 
@@ -95,7 +95,7 @@ class EvaluationLog:
 
     @property
     def resumed(self) -> str:
-        """What to tell the user of a calibration that resumes with it; '' if it has no evaluation."""
+        """A notice for the user of a calibration that resumes with this log; '' if it has no evaluation."""
         count = self.evaluations
         return f'goes on after {count} evaluations of an interrupted calibration' if count else ''
 
@@ -121,10 +121,10 @@ class EvaluationLog:
         line = _line(key, entry)
         if key in self._places or len(line) > LONGEST:
             return
-        left = memoryview(b'\n' * self._cut + line)
+        remaining = memoryview(b'\n' * self._cut + line)
         self._cut = True  # until the whole line is written
-        while left:
-            left = left[os.write(self._file, left):]
+        while remaining:
+            remaining = remaining[os.write(self._file, remaining):]
         self._cut = False
         self._places[key] = os.lseek(self._file, 0, os.SEEK_CUR) - len(line), len(line)
 
@@ -149,7 +149,7 @@ class EvaluationLog:
         self.close()
 
     def _read(self) -> None:
-        """Find the place of each whole line."""
+        """Store the place of each whole line."""
         with open(self._file, 'rb', closefd=False) as stream:
             place = 0
             while line := stream.readline(LONGEST):
@@ -173,7 +173,7 @@ def _line(key: str, entry: Entry) -> bytes:
 
 
 def _parsed(line: bytes) -> tuple[str, Entry] | None:
-    """Return key and entry of a line; None where it is cut or damaged."""
+    """Return key and entry of a line; None if it is cut or damaged."""
     body, _, check_sum = line.rpartition(b' ')
     if check_sum != _check_sum(body) + b'\n' or body.count(b' ') != 2:
         return None
@@ -182,7 +182,7 @@ def _parsed(line: bytes) -> tuple[str, Entry] | None:
         values = frozen_array(np.frombuffer(base64.b64decode(numbers, validate=True), '<f8'))
         entry = Entry(values, base64.b64decode(text, validate=True).decode('utf-8', 'surrogatepass'))
         return (key.decode(), entry) if np.isfinite(values).all() else None
-    except (binascii.Error, ValueError):  # a stranger's line, as the check sum is right
+    except (binascii.Error, ValueError):  # a stranger's line, since its check sum is right
         return None
 
 
@@ -192,18 +192,18 @@ def _check_sum(body: bytes) -> bytes:
 
 class Memory:
     """
-    What a calibration simulated before it was interrupted: new results are added to it.
+    The results in the log of a calibration; new results are added.
 
-    :param log: None: nothing is remembered.
+    :param log: None: nothing is stored.
     :param engine: digest of the engine's settings.
-    :param on_failure: called once, with a sentence, if the log can no longer be written.
+    :param on_failure: called once, with a warning, if the log can no longer be written.
     """
 
     def __init__(self, log: EvaluationLog | None = None, engine: str = '',
                  on_failure: Callable[[str], None] = lambda _: None) -> None:
         self._log, self._engine, self._on_failure = log, engine, on_failure
         self._full = False
-        self._writing = threading.Lock()  # the threads that simulate also write
+        self._writing = threading.Lock()  # threads that simulate also write
         self._digests: dict[int, tuple[Trial | Goal, str]] = {}
 
     def of(self, evaluator: Evaluator, finer: bool = False) -> EvaluatorMemory:
@@ -218,7 +218,7 @@ class Memory:
         return EvaluatorMemory(self, base, evaluator)
 
     def rollout(self, simulator: str, job: Job) -> Rollout | SimulationError | None:
-        """Return the rollout of a job by a simulator of this name, or why it failed; None if it is new."""
+        """Return the rollout of a job by a simulator of this name, or why it failed; None if not stored."""
         entry = None if self._log is None else self.find(self._key(simulator, job))
         if entry is None:
             return None
@@ -233,7 +233,7 @@ class Memory:
 
     def add_rollouts(self, simulator: str, jobs: Sequence[Job], rollouts: list[Rollout | SimulationError]
                      ) -> list[Rollout | SimulationError]:
-        """Remember the rollouts of jobs, and return them."""
+        """Store the rollouts of jobs, and return them."""
         if self._log is not None:
             for job, rollout in zip(jobs, rollouts, strict=True):
                 entry = Entry(np.zeros(0), str(rollout)) if isinstance(rollout, SimulationError) else Entry(
@@ -245,25 +245,26 @@ class Memory:
         return f'{ROLLOUT}-{digest(self._engine, simulator, self.digest(job[0]), job[1])}'
 
     def digest(self, trial: Trial) -> str:
-        """Return the digest of a trial; computed once, as trials may share hundreds of goals."""
+        """Return the digest of a trial; cached with those of its goals, as trials may share hundreds."""
         if id(trial) not in self._digests:
-            others = {one.name: getattr(trial, one.name) for one in fields(trial) if one.name != 'goals'}
+            others = {field.name: getattr(trial, field.name) for field in fields(trial)
+                      if field.name != 'goals'}
             self._digests[id(trial)] = trial, digest(others, [self._goal(goal) for goal in trial.goals])
         return self._digests[id(trial)][1]
 
     def _goal(self, goal: Goal) -> str:
         if id(goal) not in self._digests:
-            self._digests[id(goal)] = goal, digest(goal)  # with the goal, so that no other one gets its id
+            self._digests[id(goal)] = goal, digest(goal)  # with the goal, so that no other goal gets its id
         return self._digests[id(goal)][1]
 
     def find(self, key: str) -> Entry | None:
         """Return the entry with a key; None if there is none."""
-        with suppress(OSError):  # what cannot be read is simulated again
+        with suppress(OSError):  # an unreadable entry is simulated again
             return None if self._log is None else self._log.find(key)
         return None
 
     def add(self, key: str, entry: Entry) -> None:
-        """Write an entry, unless an earlier one could not be written."""
+        """Write an entry, unless an earlier entry could not be written."""
         with self._writing:
             if self._log is None or self._full:
                 return
@@ -277,9 +278,9 @@ class Memory:
 
 class EvaluatorMemory:
     """
-    The evaluations of one evaluator.
+    The stored evaluations of one evaluator.
 
-    :param base: digest of all that an evaluation depends on, except the point; empty: nothing is remembered.
+    :param base: digest of what an evaluation depends on, except the point; empty: nothing is stored.
     """
 
     def __init__(self, memory: Memory, base: str, evaluator: Evaluator) -> None:
@@ -305,7 +306,7 @@ class EvaluatorMemory:
             unsettled=tuple(trial.name for trial, flag in zip(self._trials, unsettled, strict=True) if flag))
 
     def add(self, evaluation: Evaluation) -> None:
-        """Remember a finished evaluation."""
+        """Store a finished evaluation."""
         if not self._base:
             return
         if evaluation.residuals is None or evaluation.errors is None:
@@ -321,9 +322,9 @@ class EvaluatorMemory:
 
 
 def _flags(trials: Sequence[Trial], names: Sequence[str]) -> list[float]:
-    """Return 1 for each trial that `names` contain, in the same order, and 0 for the others."""
-    flags, left = [], list(names)
+    """Return 1 for each trial in `names`, which have the order of the trials, and 0 for the others."""
+    flags, remaining = [], list(names)
     for trial in trials:
-        flags.append(float(left[:1] == [trial.name]))
-        left = left[int(flags[-1]):]
+        flags.append(float(remaining[:1] == [trial.name]))
+        remaining = remaining[int(flags[-1]):]
     return flags

@@ -16,17 +16,10 @@ from typing import Callable, Sequence, TypeVar
 
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.evaluation.log import Memory
-from dlo_calibration.simulation.protocol import (
-    Job,
-    Rollout,
-    simulate_all,
-    Simulator,
-    Stop,
-    TogetherSimulator,
-)
+from dlo_calibration.simulation.protocol import Job, Rollout, simulate_all, Simulator, Stop
 
-PERIOD = 0.05  # s between two looks whether to stop
-NICE = 5  # by which the priority of threads that simulate is lower: whoever waits for an answer comes first
+PERIOD = 0.05  # s between two polls of `should_stop`
+NICE = 5  # reduction of the priority of threads that simulate: threads that answer users come first
 
 Outcome = TypeVar('Outcome')
 
@@ -49,23 +42,23 @@ class Threads(ThreadPoolExecutor):
         super().__init__(self.workers, 'simulation', _lower_priority)
 
     def close(self) -> None:
-        """Drop what waits, and wait for what is under way."""
+        """Cancel calls that have not begun, and wait for the others."""
         self.shutdown(cancel_futures=True)
 
 
 def _lower_priority() -> None:
-    if sys.platform == 'linux':  # where a thread has a priority of its own
+    if sys.platform == 'linux':  # there, each thread has its own priority
         thread = threading.get_native_id()
         os.setpriority(os.PRIO_PROCESS, thread, min(os.getpriority(os.PRIO_PROCESS, thread) + NICE, 19))
 
 
 class Pool:
     """
-    Simulates jobs with one simulator: whoever needs rollouts asks a pool for them.
+    Simulates jobs with one simulator; a calibration gets all its rollouts from it.
 
-    Rollouts come in the order of the jobs, and do not depend on the number of workers.
+    Rollouts come in the order of the jobs and do not depend on the number of workers.
 
-    :param executor: its workers simulate: `Threads`, or a `ClusterExecutor`; None: one thread.
+    :param executor: its workers simulate: `Threads` or a `ClusterExecutor`; None: one thread.
     :param should_stop: polled while a caller waits; once it returns True, the pool stops.
     :param memory: holds earlier rollouts, which are not simulated again, and stores the new ones.
     """
@@ -89,14 +82,14 @@ class Pool:
         return other
 
     def stop(self) -> None:
-        """End all rollouts; whoever waits for one gets a CancelledError."""
+        """End all rollouts; waiting for one raises a CancelledError."""
         self._stop.set()
         for future in list(self._under_way):
             future.cancel()
 
     def portion(self, jobs: int) -> int:
-        """Return how many of so many jobs one worker should simulate in one call."""
-        most = self.simulator.at_a_time if isinstance(self.simulator, TogetherSimulator) else 1
+        """Return the number of jobs, out of `jobs`, that a worker should simulate in one call."""
+        most: int = getattr(self.simulator, 'at_a_time', 1)
         return max(1, min(most, math.ceil(jobs / getattr(self._executor, 'workers', 1))))
 
     def submit(self, jobs: Sequence[Job],
@@ -104,7 +97,7 @@ class Pool:
         """
         Begin to simulate jobs in one call of a worker; `result` waits for it.
 
-        :param then: turns the rollouts into the result of the future, as soon as they are finished.
+        :param then: converts the rollouts to the result of the future, when they are finished.
         """
         outcome: Future[Outcome] = Future()
         under_way = self._executor.submit(simulate_all, self.simulator, jobs, self._stop)
@@ -122,7 +115,7 @@ class Pool:
 
     def result(self, future: Future[Outcome]) -> Outcome:
         """
-        Wait for what was submitted.
+        Wait for the result of a future of `submit`.
 
         :raises CancelledError: when stopped.
         """
@@ -136,20 +129,20 @@ class Pool:
         raise CancelledError
 
     def begin(self, jobs: Sequence[Job]) -> Callable[[], list[Rollout | SimulationError]]:
-        """Begin to simulate jobs on all workers; return a function that waits for what `simulate` returns."""
+        """Begin to simulate jobs on all workers; return a function that waits for the rollouts."""
         name = self.simulator.name
-        rollouts = [self._memory.rollout(name, job) for job in jobs]
-        new = [k for k, rollout in enumerate(rollouts) if rollout is None]
+        stored = [self._memory.rollout(name, job) for job in jobs]
+        new = [k for k, rollout in enumerate(stored) if rollout is None]
         size, futures = self.portion(len(new)), []
         for first in range(0, len(new), size):
             portion = [jobs[k] for k in new[first:first + size]]
             futures.append(self.submit(portion, partial(self._memory.add_rollouts, name, portion)))
 
-        def ended() -> list[Rollout | SimulationError]:
+        def result() -> list[Rollout | SimulationError]:
             simulated = iter([rollout for future in futures for rollout in self.result(future)])
-            return [next(simulated) if rollout is None else rollout for rollout in rollouts]
+            return [next(simulated) if rollout is None else rollout for rollout in stored]
 
-        return ended
+        return result
 
     def simulate(self, jobs: Sequence[Job]) -> list[Rollout | SimulationError]:
         """

@@ -4,9 +4,9 @@
 """
 ProcessSimulator: a simulator in a process of its own, which may crash or hang without harm.
 
-PyBullet needs this: it holds Python's lock all the time, and a stranger's scene may crash it.  A
-ProcessPoolExecutor is broken for good when a process dies, and can neither stop a call nor replace a process
-that hangs; pebble's limit is on the whole call, but a long rollout that still makes progress must go on: the
+PyBullet needs this: it never releases Python's lock, and a stranger's scene may crash it.  A
+ProcessPoolExecutor is unusable once a process has died, and can neither stop a call nor replace a process
+that hangs.  pebble limits the time of a whole call, but a long rollout that makes progress must go on: the
 heartbeat here measures only the time in which native code does not return.
 """
 
@@ -24,30 +24,33 @@ import subprocess
 import sys
 import threading
 import time
-from typing import Any, Callable, NoReturn, Sequence
+from typing import Any, Callable, Mapping, NoReturn, Sequence
 
 from dlo_calibration.errors import DloCalibrationError, SimulationError
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.simulation.protocol import Job, Rollout, Simulator, Stop, TogetherSimulator
+from dlo_calibration.simulation.scene import Obstacle
 
 DEATHS = 3  # processes that may end at the same rollout before it fails
 HANGING = 1  # exit code of `faulthandler`
-PERIOD = 0.05  # s between two looks whether to stop
-MOST_TRIALS = 1000  # that a process keeps
-PROGRAM = 'import sys; sys.path[:] = {path}; from {module} import work; work({number}, {limit})'
+PERIOD = 0.05  # s between two polls of the stop flag
+MOST_TRIALS = 1000  # in a process
+NICE = 5  # by which the priority of a process is lower: the parent, which answers users, comes first
+PROGRAM = ('import os, sys; os.nice({nice}); sys.path[:] = {path}; from {module} import work; '
+           'work({number}, {limit})')
 
 
 class ProcessSimulator(TogetherSimulator):
     """
-    A simulator in a process of its own, one for each thread that calls it at the same time.
+    A simulator in a process of its own; threads that call it at the same time have one process each.
 
-    The processes start with the first rollouts, and end by `close`, or when this process ends or is killed.
+    The processes start with the first rollouts.  They end by `close`, or when this process ends or is killed.
 
     :param name: of the simulator.
-    :param make: makes the simulator, there; it can be pickled.
-    :param content: what is simulated, in words, e.g. ``scene cell.urdf``.
+    :param make: makes the simulator in the process; picklable.
+    :param content: what is simulated, for warnings and errors, e.g. ``scene cell.urdf``.
     :param answer_limit: time [s] without an answer of native code after which a process is replaced.
-    :param finer: how often the simulator is refined.
+    :param finer: number of times that the simulator is refined.
     """
 
     at_a_time = 1
@@ -57,10 +60,14 @@ class ProcessSimulator(TogetherSimulator):
         self.name = name
         self._make, self._content, self._answer_limit, self._finer = make, content, answer_limit, finer
         self._idle: list[_Process] = []
+        #: number of processes that were started in advance
+        self.processes = 1
 
-    def start(self) -> None:
-        """Start a process now, which loads the simulator while this one does something else."""
-        self._idle.append(self._process())
+    def start(self, processes: int) -> None:
+        """Start processes now, so that they load the simulator in the background."""
+        self.processes = processes
+        for _ in range(processes):
+            self._idle.append(self._process())
 
     def simulate_together(self, jobs: Sequence[Job], stop: Stop) -> list[Rollout | SimulationError]:
         """
@@ -75,7 +82,7 @@ class ProcessSimulator(TogetherSimulator):
         return ProcessSimulator(self.name, self._make, self._content, self._answer_limit, self._finer + 1)
 
     def close(self) -> None:
-        """End the processes that are idle; the next call starts another."""
+        """End the idle processes; the next call starts another."""
         while self._idle:
             self._idle.pop().end()
 
@@ -107,7 +114,7 @@ class ProcessSimulator(TogetherSimulator):
             f'unexpectedly at the same evaluation, the last one {ending}; {remedy}')
 
     def _ending(self, code: int, silence: float) -> tuple[str, str]:
-        """Return in words how a process ended, and what to do about it."""
+        """Return how a process ended and what to do about it, in words."""
         remedy = 'free memory, or use fewer workers'
         if code == HANGING and silence >= self._answer_limit:
             return f'gave no answer for {self._answer_limit:g} s and is replaced', 'raise answer_limit'
@@ -119,22 +126,24 @@ class ProcessSimulator(TogetherSimulator):
         return killed, f'{remedy}, or simulate without a scene'
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out the processes, which belong to this one."""
+        """Leave out the processes, which are children of this process."""
         return {**self.__dict__, '_idle': []}
 
 
 class _Process:
-    """A process that simulates, and the trials that were sent to it."""
+    """A process that simulates, and the trials that it has received."""
 
     def __init__(self, make: Callable[[], Simulator], finer: int, answer_limit: float) -> None:
         self._channel, there = Pipe()
-        # Not the folder in which the user works: files there may have any name.
+        # Leave out the working directory (''): a file there may have the name of a module.
         path = [*filter(None, sys.path), str(Path(__file__).parents[2])]
-        program = PROGRAM.format(path=path, module=__name__, number=there.fileno(), limit=answer_limit)
+        program = PROGRAM.format(
+            nice=NICE, path=path, module=__name__, number=there.fileno(), limit=answer_limit)
         try:
             self._process = subprocess.Popen(
-                [sys.executable, '-c', program], pass_fds=[there.fileno()], process_group=0,
-                stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+                [sys.executable, '-S', '-c', program], pass_fds=[there.fileno()], process_group=0,
+                stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+                env={**os.environ, 'OPENBLAS_NUM_THREADS': '1'})  # others would spin for 50 ms
         except OSError as error:
             raise DloCalibrationError(f'a process that simulates could not be started ({error}); '
                                       'use fewer workers') from error
@@ -146,7 +155,7 @@ class _Process:
 
     def simulated(self, job: Job, stop: Stop) -> Any:
         """
-        Return the rollout of a job, or the error that it raised there.
+        Return the rollout of a job, or the error that the job raised in the process.
 
         :raises EOFError, OSError: if the process ends.
         :raises CancelledError: as soon as `stop` is set.
@@ -154,17 +163,17 @@ class _Process:
         trial, physical = job
         if len(self._sent) == MOST_TRIALS:
             self._sent.clear()
-        known = id(trial) in self._sent
+        is_new = id(trial) not in self._sent
         _, number = self._sent.setdefault(id(trial), (trial, len(self._sent)))
         self.asked = time.monotonic()
-        self._channel.send((number, None if known else trial, dict(physical)))
+        self._channel.send((number, trial if is_new else None, dict(physical)))
         while not self._channel.poll(PERIOD):
             if stop.is_set():
                 raise CancelledError
         return self._channel.recv()
 
     def end(self, patience: float = 0.0) -> int:
-        """End the process; return its exit code. If it ends itself, wait for that, for `patience` [s]."""
+        """Return the exit code of the process, which is killed if it does not end within `patience` [s]."""
         self._channel.close()
         try:
             return self._process.wait(patience)
@@ -173,9 +182,15 @@ class _Process:
             return self._process.wait()
 
 
+def bullet_simulator(settings: Mapping[str, Any], obstacles: Sequence[Obstacle]) -> Simulator:
+    """Return the engine in PyBullet; only the process that simulates imports it."""
+    from dlo_calibration.simulation.bullet import BulletSimulator
+
+    return BulletSimulator(obstacles=obstacles, **settings)
+
+
 def work(number: int, answer_limit: float) -> None:
     """Simulate until the parent closes the connection; the main function of a process."""
-    os.nice(5)  # whoever waits for an answer of the parent comes first
     nowhere = open(os.devnull, 'w')
     end_later = partial(faulthandler.dump_traceback_later, answer_limit, exit=True, file=nowhere)
     end_later()  # before anything can hang
@@ -184,23 +199,22 @@ def work(number: int, answer_limit: float) -> None:
     channel = Connection(number)
     try:
         make, finer = channel.recv()
-        made: Simulator | Exception
+        failure: Exception | None = None
         try:
             simulator = make()
             for _ in range(finer):
                 simulator = simulator.refined() or simulator
-            made = simulator
-        except Exception as error:  # raised by the first rollout
-            made = error
+        except Exception as error:  # each rollout raises it
+            failure = error
         trials: dict[int, Trial] = {}
         while True:
             place, trial, physical = channel.recv()
             if trial is not None:
                 trials[place] = trial
             try:
-                if isinstance(made, Exception):
-                    raise made
-                answer: Any = made.simulate(trials[place], physical)
+                if failure is not None:
+                    raise failure
+                answer: Any = simulator.simulate(trials[place], physical)
             except Exception as error:
                 answer = error
             try:
@@ -213,9 +227,9 @@ def work(number: int, answer_limit: float) -> None:
 
 def _watch(end_later: Callable[[], None], period: float, parent: int) -> NoReturn:
     """
-    Heartbeat: put off the end of the process at each `period` [s], until its parent has ended.
+    Heartbeat: every `period` [s], postpone the end of the process, until its parent has ended.
 
-    Native code that hangs holds Python's lock, so that this thread can no longer put it off.
+    Native code that hangs holds Python's lock, so that this thread can no longer postpone it.
     """
     while os.getppid() == parent:
         end_later()

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-ResidualLayout: where each trial, goal and point is in the residual vector; Huber: a robust loss.
+ResidualLayout: the place of each trial, goal and point in the residual vector; Huber: a robust loss.
 
 A tracker observes a moving DLO a hundred times a second, and neighbouring frames carry the same
-information: search and examination compare only `compared_goals`, which saves most of their linear algebra
-and memory.
+information.  So search and examination use only the residuals at the `compared_goals`, which saves most of
+their linear algebra and memory.
 """
 
 from __future__ import annotations
@@ -29,8 +29,7 @@ def compared_goals(trial: Trial) -> list[int]:
     """
     Return the indices of the goals that search and examination compare.
 
-    These are all stable goals, and at most MOST_TIMED timed ones, nearest to instants that are evenly spread
-    from the first to the last of them.
+    These are all stable goals and at most MOST_TIMED timed goals, those nearest to evenly spaced instants.
     """
     timed = [k for k, goal in enumerate(trial.goals) if not goal.stable]
     if len(timed) <= MOST_TIMED:
@@ -51,8 +50,8 @@ class ResidualLayout:
     Points that were not seen have no residuals. The rows of its Jacobian have the same order.
 
     :param shapes: numbers of goals and points of each of T trials.
-    :param unseen: for each trial, the unseen points: goal times the number of points, plus point; empty: none
-        in any trial.
+    :param unseen: for each trial, the indices of unseen points: goal times the number of points, plus point;
+        empty: all points of all trials were seen.
     """
 
     shapes: tuple[tuple[int, int], ...]
@@ -78,19 +77,19 @@ class ResidualLayout:
     @property
     def rows(self) -> list[slice]:
         """The rows of each trial, T slices."""
-        missing = [len(one) for one in self.unseen] or [0] * len(self.shapes)
-        ends = np.cumsum([0, *(3 * (goals * points - fewer) for (goals, points), fewer
-                               in zip(self.shapes, missing, strict=True))]).tolist()
+        unseen = [len(indices) for indices in self.unseen] or [0] * len(self.shapes)
+        ends = np.cumsum([0, *(3 * (goals * points - count) for (goals, points), count
+                               in zip(self.shapes, unseen, strict=True))]).tolist()
         return [slice(begin, end) for begin, end in zip(ends[:-1], ends[1:], strict=True)]
 
     def folds(self, most: int) -> list[slice]:
-        """Return the rows of each fold of a cross-validation: a trial, or neighbours if they are many."""
+        """Return the rows of at most `most` folds of a cross-validation, each of neighbouring trials."""
         rows = self.rows
         groups = np.array_split(np.arange(len(rows)), min(len(rows), most))
         return [slice(rows[group[0]].start, rows[group[-1]].stop) for group in groups]
 
     def aligned(self, values: Floats) -> list[Floats]:
-        """Split (m, ...) values by trial; those of goal, point and coordinate, with 0 at unseen points."""
+        """Split (m, ...) values by trial, with a row per goal, point and coordinate, 0 if unseen."""
         return [np.nan_to_num(self._spread(k, values[rows].reshape(-1, 3, *values.shape[1:]))).reshape(
             -1, *values.shape[1:]) for k, rows in enumerate(self.rows)]
 
@@ -100,12 +99,12 @@ class ResidualLayout:
                 for k, (rows, shape) in enumerate(zip(self.rows, self.shapes, strict=True))]
 
     def by_point(self, values: Floats) -> list[Floats]:
-        """Split (m / 3,) values, one per point, into one array (goals, points) per trial; else NaN."""
+        """Split (m / 3,) values, one per seen point, into one array (goals, points) per trial; else NaN."""
         return [self._spread(k, values[rows.start // 3:rows.stop // 3]).reshape(shape)
                 for k, (rows, shape) in enumerate(zip(self.rows, self.shapes, strict=True))]
 
     def _spread(self, k: int, seen: NDArray[Any]) -> NDArray[Any]:
-        """Return the values of all points of trial k from those of its seen points."""
+        """Return values of all points of trial k, from those of its seen points; NaN at unseen points."""
         if not self.unseen or not self.unseen[k]:
             return seen
         goals, points = self.shapes[k]
@@ -115,7 +114,7 @@ class ResidualLayout:
 
 
 def compared_rows(trials: Sequence[Trial]) -> NDArray[np.intp] | None:
-    """Return which residuals at every goal are compared, (m,); None: all of them."""
+    """Return the (m,) indices of the compared residuals among those at every goal; None: all of them."""
     chosen = [compared_goals(trial) for trial in trials]
     if all(len(goals) == len(trial.goals) for goals, trial in zip(chosen, trials, strict=True)):
         return None
@@ -127,24 +126,23 @@ def compared_rows(trials: Sequence[Trial]) -> NDArray[np.intp] | None:
 
 def at_every_goal(values: Floats, trials: Sequence[Trial]) -> Floats:
     """
-    Return values for the points of every goal, from (p,) values for those of the compared ones.
+    Return values for the points of every goal, from (p,) values for the points of the compared goals.
 
-    Between two compared goals that show a point they are interpolated linearly in time.
+    Values of a point are interpolated linearly in time between the compared goals that show it.
     """
     filled = []
     for trial, block in zip(trials, ResidualLayout.compared(trials).by_point(values), strict=True):
         goals, times = compared_goals(trial), [goal.time for goal in trial.goals]
-        known, usual = np.array(times)[goals], np.nanmean(block)
-        columns = [np.isfinite(column) for column in block.T]
-        whole = np.stack([np.interp(times, known[there], column[there]) if there.any() else
-                          np.full(len(times), usual)
-                          for there, column in zip(columns, block.T, strict=True)], axis=1)
+        compared, mean = np.array(times)[goals], np.nanmean(block)
+        whole = np.stack([np.interp(times, compared[seen], column[seen]) if seen.any() else
+                          np.full(len(times), mean)
+                          for seen, column in zip(np.isfinite(block.T), block.T, strict=True)], axis=1)
         whole[goals] = np.where(np.isfinite(block), block, whole[goals])
         filled.append(whole[seen_points(trial)])
     return np.concatenate(filled)
 
 
-EFFICIENT = 1.345  # standard deviations; as the threshold it has 95 % of the efficiency of least squares
+EFFICIENT = 1.345  # standard deviations; a threshold with 95 % of the efficiency of least squares
 CLIPPED_SQUARE = 0.7102  # mean square of a standard normal value that is clipped at EFFICIENT
 SMALLEST_RESIDUAL = 1e-9  # m; keeps the scale above zero where a model fits exactly
 
@@ -161,11 +159,11 @@ class Huber:
 
     @classmethod
     def of(cls, residuals: Floats) -> Huber:
-        """Return the loss whose threshold suits the spread of (m,) residuals [m]."""
+        """Return the loss with the threshold for the spread of (m,) residuals [m]."""
         if not residuals.size:
             return cls(1.0)
         # The median of |x| is 0.6745 for a standard normal x.  If most residuals are nearly zero, that spread
-        # is too small: a tenth of the root mean square is the least.
+        # is too small; then a tenth of the root mean square is used.
         spread = float(np.median(np.abs(residuals))) / 0.6745
         floor = 0.1 * float(np.sqrt(np.mean(residuals ** 2)))
         return cls(max(EFFICIENT * spread, floor, SMALLEST_RESIDUAL))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Conduct: performs the missing calibrations of an experiment, and writes its tables and pictures."""
+"""conduct(): perform the missing calibrations of an experiment, and write its tables and pictures."""
 
 from __future__ import annotations
 
@@ -10,53 +10,47 @@ import functools
 import json
 from operator import itemgetter
 from pathlib import Path
-from typing import Callable, Sequence, TextIO
+from typing import Sequence
 
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.experiment import tables
-from dlo_calibration.experiment.journal import performed
+from dlo_calibration.experiment.journal import Journal, Laboratory
 from dlo_calibration.experiment.study import judged_chains, Outcome, perform, Study, Subject, Task
 from dlo_calibration.experiment.summary import complete_runs, run_score, summary
 from dlo_calibration.report.drawing import session_picture
-from dlo_calibration.writing import Attempts, make_folder, whole
+from dlo_calibration.writing import Attempts, whole
 
 JOURNAL = 'calibrations.jsonl'  # in the folder of an experiment
 
 
-def conduct(study: Study, folder: Path, make_simulator: SimulatorFactory, stop: Callable[[], bool],
-            note: Callable[[str], None], stream: TextIO) -> tuple[tables.Account | None, Attempts]:
+def conduct(study: Study, laboratory: Laboratory, make_simulator: SimulatorFactory) -> tables.Account | None:
     """
-    Perform the calibrations whose outcome is not in `folder` yet, then write tables and pictures of all.
+    Perform the calibrations whose outcome the laboratory lacks, then write tables and pictures of all.
 
-    If it is stopped, or outcomes can no longer be kept, tables and pictures show the runs that are complete.
+    If it is stopped, or outcomes cannot be written, tables and pictures show the runs that are complete.
 
-    :param note: called with each sentence for the user.
-    :param stream: for a progress bar.
-    :returns: what the tables show, None if no run is complete; and the files that could not be written.
-    :raises InputError: if `folder` cannot be made, or its journal cannot be read.
+    :returns: the content of the tables; None if no run is complete.
+    :raises InputError: if the journal cannot be read.
     """
-    make_folder(folder)
-    attempts = Attempts(folder)
     engines = {subject.name: _engine(subject, make_simulator) for subject in study.subjects}
     wanted = list(study.tasks(engines))
-    done = performed('calibrations', wanted, folder / JOURNAL, Outcome.of,
-                     functools.partial(perform, make_simulator=make_simulator), study.workers, attempts, stop,
-                     note, stream)
+    done = laboratory.outcomes('calibrations', wanted, Journal(laboratory.folder / JOURNAL, Outcome.of),
+                               functools.partial(perform, make_simulator=make_simulator))
     groups = [group for subject in study.subjects for search in study.searches
               if complete_runs(group := [(task, outcome) for task, outcome in done
                                          if task.subject is subject and task.search == search])]
     if not groups:
-        return None, attempts
+        return None
     account = tables.Account(
         tuple(summary(group) for group in groups), study.command, ', '.join(dict.fromkeys(engines.values())),
         study.runs, study.evaluations, study.samples, complete=len(done) == len(wanted))
-    _write_all(account, groups, done, make_simulator, attempts)
-    if not attempts.failure:
-        note(f'tables and pictures are in {folder}')
+    _write_all(account, groups, done, make_simulator, laboratory.attempts)
+    if not laboratory.attempts.failure:
+        laboratory.report(f'tables and pictures are in {laboratory.folder}')
     if not account.complete:
-        note(f'interrupted: {len(done)} of {len(wanted)} calibrations are done; '
-             'the same command continues with the others')
-    return account, attempts
+        laboratory.report(f'interrupted: {len(done)} of {len(wanted)} calibrations are done; '
+                          'the same command continues with the others')
+    return account
 
 
 def _engine(subject: Subject, make_simulator: SimulatorFactory) -> str:

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Journal: keeps the outcomes of an experiment on disk, so that it can continue after an interruption."""
+"""Laboratory and journal: perform tasks and record their outcomes, so that an experiment can continue."""
 
 from __future__ import annotations
 
 from concurrent.futures import CancelledError, FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from errno import EEXIST
 import json
 import os
@@ -17,7 +17,7 @@ from typing import Any, Callable, Generic, Iterator, Mapping, Protocol, Sequence
 
 from dlo_calibration.errors import InputError
 from dlo_calibration.evaluation.pool import cores, PERIOD
-from dlo_calibration.writing import Attempts
+from dlo_calibration.writing import Attempts, make_folder
 
 Done = TypeVar('Done')
 
@@ -31,7 +31,7 @@ class Recorded(Protocol):
 
     @property
     def about(self) -> Mapping[str, Any]:
-        """Plain values that tell a reader of the journal which task it is."""
+        """Plain values that identify the task for a reader of the journal."""
 
 
 class Journal(Generic[Done]):
@@ -47,7 +47,7 @@ class Journal(Generic[Done]):
     """
 
     def __init__(self, path: Path, of: Callable[[Mapping[str, Any]], Done]) -> None:
-        self._path = path
+        self.path = path
         self.failure = ''
         self._outcomes: dict[str, Done] = {}
         try:
@@ -75,7 +75,7 @@ class Journal(Generic[Done]):
         plain: Any = outcome
         line = json.dumps({**task.about, 'outcome': asdict(plain), 'key': task.key})
         try:
-            with self._path.open('a', encoding='utf-8') as stream:
+            with self.path.open('a', encoding='utf-8') as stream:
                 stream.write(('\n' if self._cut else '') + f'{line}\n')
                 stream.flush()
                 os.fsync(stream.fileno())
@@ -85,70 +85,86 @@ class Journal(Generic[Done]):
             self._cut = False
         self._outcomes[task.key] = outcome
 
-NOTE_PERIOD = 30.0  # s between two sentences on what is left, in a log file
+
+REPORT_PERIOD = 30.0  # s between two sentences on the remaining time, in a log file
 
 AnyTask = TypeVar('AnyTask', bound=Recorded)
 
 
-def performed(what: str, tasks: Sequence[AnyTask], path: Path, of: Callable[[Mapping[str, Any]], Done],
-              perform: Callable[..., Done], workers: int, attempts: Attempts, stop: Callable[[], bool],
-              note: Callable[[str], None], stream: TextIO) -> list[tuple[AnyTask, Done]]:
+@dataclass(frozen=True)
+class Laboratory:
     """
-    Perform the tasks that a journal lacks, each in one thread, and return all tasks that are done.
+    Performs the tasks of an experiment, and keeps its files in one folder.
 
-    Each outcome is written at once.  It ends early if it is stopped, or if an outcome cannot be written.
-
-    :param what: the tasks are called.
-    :param path: of the journal; `of` builds its outcomes, see `Journal`.
-    :param perform: called with a task and the keyword `should_stop`; returns its outcome, or raises
-        CancelledError once `should_stop` is True.
+    :param folder: for journals, tables and pictures.
     :param workers: threads; 0: one per core.
-    :param attempts: gets the journal as a failure if it cannot be written.
-    :param note: called with each sentence for the user.
-    :param stream: for a progress bar.
-    :raises InputError: if the journal cannot be read.
+    :param stop: polled; once it returns True, no further task is performed.
+    :param report: called with each sentence for the user.
+    :param stream: for progress bars.
+    :ivar attempts: the files that were written, and those that could not be.
+    :raises InputError: if the folder cannot be made.
     """
-    from dlo_calibration.report.terminal import TaskBar
 
-    journal, total = Journal(path, of), len(tasks)
-    waiting = [task for task in tasks if journal.find(task) is None]
-    if 0 < len(waiting) < total:
-        note(f'{total - len(waiting)} of {total} {what} are done already')
-    begun = noted = time.monotonic()
-    if waiting:
-        with TaskBar(what, total, total - len(waiting), stream) as bar:
-            outcomes = _outcomes(waiting, perform, min(workers or cores(), len(waiting)), stop)
-            for count, (task, outcome) in enumerate(outcomes, start=1):
-                journal.add(task, outcome)
-                if journal.failure:
-                    attempts.fail(f'the end of {path.name}', journal.failure)
-                    break
-                bar.advance()
-                now = time.monotonic()
-                if not bar.shown and now - noted > NOTE_PERIOD:
-                    noted = now
-                    left = (now - begun) / count * (len(waiting) - count)
-                    note(f'{total - len(waiting) + count} of {total} {what}; {left:.0f} s left')
-    return [(task, known) for task in tasks if (known := journal.find(task)) is not None]
+    folder: Path
+    workers: int
+    stop: Callable[[], bool]
+    report: Callable[[str], None]
+    stream: TextIO
+    attempts: Attempts = field(init=False)
 
+    def __post_init__(self) -> None:
+        make_folder(self.folder)
+        object.__setattr__(self, 'attempts', Attempts(self.folder))
 
-def _outcomes(waiting: Sequence[AnyTask], perform: Callable[..., Done], workers: int,
-              stop: Callable[[], bool]) -> Iterator[tuple[AnyTask, Done]]:
-    """Yield each task with its outcome when it is done; end early if stopped."""
-    ended = threading.Event()
+    def outcomes(self, what: str, tasks: Sequence[AnyTask], journal: Journal[Done],
+                 perform: Callable[..., Done]) -> list[tuple[AnyTask, Done]]:
+        """
+        Perform the tasks that a journal lacks, each in one thread, and return all tasks that are done.
 
-    def should_stop() -> bool:
-        return ended.is_set() or stop()
+        Each outcome is written at once.  It ends early if it is stopped, or if an outcome cannot be written.
 
-    with ThreadPoolExecutor(workers) as executor:
-        try:
-            futures: dict[Future[Done], AnyTask] = {
-                executor.submit(perform, task, should_stop=should_stop): task for task in waiting}
-            while futures and not stop():
-                for future in wait(futures, PERIOD, FIRST_COMPLETED).done:
-                    yield futures.pop(future), future.result()
-        except CancelledError:  # a task was stopped
-            return
-        finally:
-            ended.set()
-            executor.shutdown(cancel_futures=True)
+        :param what: the tasks are called.
+        :param perform: called with a task and the keyword `should_stop`; returns its outcome, or raises
+            CancelledError once `should_stop` is True.
+        """
+        from dlo_calibration.report.terminal import TaskBar
+
+        total, waiting = len(tasks), [task for task in tasks if journal.find(task) is None]
+        if 0 < len(waiting) < total:
+            self.report(f'{total - len(waiting)} of {total} {what} are done already')
+        begun = reported = time.monotonic()
+        if waiting:
+            with TaskBar(what, total, total - len(waiting), self.stream) as bar:
+                for count, (task, new) in enumerate(self._performed(waiting, perform), start=1):
+                    journal.add(task, new)
+                    if journal.failure:
+                        self.attempts.fail(f'the end of {journal.path.name}', journal.failure)
+                        break
+                    bar.advance()
+                    now = time.monotonic()
+                    if not bar.shown and now - reported > REPORT_PERIOD:
+                        reported = now
+                        seconds = (now - begun) / count * (len(waiting) - count)
+                        self.report(f'{total - len(waiting) + count} of {total} {what}; {seconds:.0f} s left')
+        return [(task, stored) for task in tasks if (stored := journal.find(task)) is not None]
+
+    def _performed(self, waiting: Sequence[AnyTask], perform: Callable[..., Done]
+                   ) -> Iterator[tuple[AnyTask, Done]]:
+        """Yield each task with its outcome when it is done; end early if stopped."""
+        ended = threading.Event()
+
+        def should_stop() -> bool:
+            return ended.is_set() or self.stop()
+
+        with ThreadPoolExecutor(min(self.workers or cores(), len(waiting))) as executor:
+            try:
+                futures: dict[Future[Done], AnyTask] = {
+                    executor.submit(perform, task, should_stop=should_stop): task for task in waiting}
+                while futures and not self.stop():
+                    for future in wait(futures, PERIOD, FIRST_COMPLETED).done:
+                        yield futures.pop(future), future.result()
+            except CancelledError:  # a task was stopped
+                return
+            finally:
+                ended.set()
+                executor.shutdown(cancel_futures=True)

@@ -4,7 +4,7 @@
 """
 Study: the calibrations that answer the paper's two questions.
 
-Consistency: does a calibration find the same parameters with every random seed?
+Consistency: does every random seed lead to the same parameters?
 Validity: do the parameters explain an action that was left out of the calibration?  (Alvarez, Yamazaki and
 Matsubara, tables 1 and 2.)
 """
@@ -21,7 +21,7 @@ from typing import Any, Callable, Iterator, Mapping
 from dlo_calibration.calibration.calibrate import fitted
 from dlo_calibration.calibration.choice import choose
 from dlo_calibration.calibration.engines import SimulatorFactory
-from dlo_calibration.calibration.options import MACHINE, names_of, Options
+from dlo_calibration.calibration.options import Options, recordable
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.errors import InputError, SimulationError
@@ -32,7 +32,7 @@ from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.material import with_shared_places
 from dlo_calibration.search import SEARCHES
 
-#: Rooms whose code decides what a calibration or a plan finds.
+#: Rooms whose code determines the outcome of a calibration or a plan.
 DECISIVE = ('model', 'observation', 'simulation', 'evaluation', 'search', 'inference', 'calibration',
             'planning', 'experiment')
 
@@ -120,7 +120,7 @@ class Task:
 
     @property
     def about(self) -> dict[str, Any]:
-        """Plain values that tell a reader of the journal which calibration it is."""
+        """Plain values that identify the calibration for a reader of the journal."""
         return {'object': self.subject.name, 'search': self.search, 'seed': self.seed, 'engine': self.engine,
                 'left_out': None if self.left_out is None else self.left_out + 1}
 
@@ -128,18 +128,17 @@ class Task:
     def key(self) -> str:
         """A digest of all that the outcome depends on: tasks with the same key have the same outcome."""
         judges = self.judges
-        return task_digest(self.engine, self.trials, effective(self.options), judges.trials,
-                           effective(judges.options))
+        return task_digest(self.engine, self.trials, recordable(self.options.flat()), judges.trials,
+                           recordable(judges.options.flat()))
 
 
 @dataclass(frozen=True)
 class Study:
     """
-    What an experiment does.
+    The plan of an experiment.
 
     :param runs: calibrations of each subject with each search, each with its own seed.
     :param seed: of the first run; each further run adds 1.
-    :param workers: threads; 0: one per core.
     :param command: the command that repeats the experiment.
     :param samples: whether the subjects are the samples of the package.
     """
@@ -148,7 +147,6 @@ class Study:
     searches: tuple[str, ...]
     runs: int
     seed: int
-    workers: int
     command: str
     samples: bool
 
@@ -182,16 +180,11 @@ def task_digest(*about: Any) -> str:
     return digest(code_digest(DECISIVE), *about)
 
 
-def effective(options: Options) -> dict[str, Any]:
-    """Return the options that can change what a calibration finds."""
-    of_the_machine = names_of(MACHINE)
-    return {name: value for name, value in options.flat().items() if name not in of_the_machine}
-
 
 @dataclass(frozen=True)
 class Judgement:
     """
-    How well the found parameters explain a trial that was left out of the calibration.
+    How well the calibrated parameters explain a trial that was left out of the calibration.
 
     :param score: difference score [cm]; None if the trial could not be simulated.
     :param error: mean point error [m]; None likewise.
@@ -210,7 +203,7 @@ class Outcome:
     The result of one calibration.
 
     :param values: of the parameters, 0..100; empty if it failed.
-    :param excited: names of the parameters that the trials inform about; the others keep their default.
+    :param excited: names of the parameters that the trials show; the others keep their default.
     :param score: average difference score of the trials calibrated on [cm].
     :param error: mean point error of the same trials [m].
     :param evaluations: number of evaluations of the search.
@@ -240,7 +233,7 @@ class Outcome:
 def perform(task: Task, make_simulator: SimulatorFactory,
             should_stop: Callable[[], bool] = lambda: False) -> Outcome:
     """
-    Calibrate once, on one thread, and judge the parameters found.
+    Calibrate once, on one thread, and judge the parameters.
 
     :raises CancelledError: if stopped.
     """
@@ -267,7 +260,7 @@ def judged_chains(task: Task, outcome: Outcome, make_simulator: SimulatorFactory
                   ) -> list[tuple[Trial, Floats]]:
     """Return the trials that judge a task, each with its simulated chains at the goals, (g, n, 3) [m]."""
     judges, chains = task.judges, []
-    space = replace(task.options.space, free=tuple(outcome.values))  # with the parts that the search found
+    space = replace(task.options.space, free=tuple(outcome.values))  # with the chosen parts
     with closing(make_simulator(judges.options)) as simulator:
         for trial in with_shared_places(judges.trials):
             physical = space.physical(outcome.values, trial.initial.length)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Summary: measures consistency and validity over many calibrations of the same object."""
+"""Summary: consistency and validity over many calibrations of the same object."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Spread:
         """Return the spread of numbers; None if there are none."""
         if not numbers:
             return None
-        away = np.subtract(numbers, numbers[0])  # exactly 0 where all are the same, which the mean may not be
+        away = np.subtract(numbers, numbers[0])  # exactly 0 if all are equal, unlike those from the mean
         return cls(fmean(numbers), float(np.std(away, ddof=1)) if len(numbers) > 1 else None, len(numbers))
 
 
@@ -43,8 +43,8 @@ class Findings:
     The results of all runs of one search on one object.
 
     :param parameters: consistency: the value of each parameter, 0..100, calibrated on all trials.
-    :param informed: number of runs in which the trials informed about each parameter; in the others, it
-        kept its default.
+    :param informed: number of runs in which the trials showed each parameter; in the others, it kept its
+        default.
     :param fitted: mean point error of the trials calibrated on [m].
     :param score: validity: a run's average difference score over the trials that judge it [cm].
     :param very_similar: number of runs whose score is below `VERY_SIMILAR`.
@@ -87,8 +87,8 @@ def run_score(run: Sequence[tuple[Task, Outcome]]) -> float | None:
 
 
 def _mean(numbers: Sequence[float | None]) -> float | None:
-    known = [number for number in numbers if number is not None]
-    return fmean(known) if known else None
+    valid = [number for number in numbers if number is not None]
+    return fmean(valid) if valid else None
 
 
 def summary(done: Sequence[tuple[Task, Outcome]]) -> Findings:

@@ -52,12 +52,12 @@ COLOURS = (BLUE, YELLOW, GREEN, PURPLE)  # of searches, in turn
 @dataclass(frozen=True)
 class Account:
     """
-    What the tables of an experiment show.
+    The content of the tables of an experiment.
 
     :param findings: one for each object and search.
     :param command: the command that repeats it.
     :param engine: name of the simulator.
-    :param runs: number of runs of each object and search that were asked for.
+    :param runs: requested number of runs of each object and search.
     :param evaluations: largest number in a calibration, by search.
     :param samples: whether the objects are the package's samples, which resemble the paper's.
     :param complete: whether all runs are done.
@@ -158,7 +158,7 @@ def runs_csv(done: Sequence[tuple[Task, Outcome]]) -> str:
 
 def scatter_picture(done: Sequence[Sequence[tuple[Task, Outcome]]], path: Path) -> None:
     """
-    Draw the parameters that each run found, with the searches beside each other.
+    Draw the parameters of each run, with the searches beside each other.
 
     :param done: one group of calibrations for each object and search.
     :raises InputError: if the file cannot be written.

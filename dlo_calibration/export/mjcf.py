@@ -175,7 +175,7 @@ class _MjcfWriter:
         rope = self._rope
         ends = float(rope.bending_stiffness.min()), float(rope.bending_stiffness.max())
         bending = measured(ends[0], 'N m^2') if np.isclose(*ends) else interval(*ends, 'N m^2')
-        lines = [
+        return [
             'A calibrated DLO, written by dlo_calibration; SI units. Found parameters:', *rope.values,
             *rope.warnings, 'Kept:',
             f'EI of {bending} in the ball joints, the rest shape (the bodies stand in it), mass of '
@@ -186,7 +186,6 @@ class _MjcfWriter:
             'Not kept:', *self._lost(),
             'In a world of your own, whose options hold instead of those here, take this time step or a '
             f'shorter one, the elliptic cone, impratio {HARDNESS}, and this viscosity.']
-        return lines
 
     def _lost(self) -> list[str]:
         """Return a line for each property of the DLO that MuJoCo cannot represent."""

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.result import ParameterEstimate
 from dlo_calibration.inference.uncertainty import NOT_IDENTIFIABLE
 from dlo_calibration.model.chain import Chain, Floats, frozen_array
 from dlo_calibration.model.parameters import BY_NAME, measured, natural_curvature, ParameterSpace, PART_NAMES
@@ -215,7 +216,7 @@ def _smallest_rotation(start: Floats, end: Floats) -> Floats:
 
 def _values(dlo: CalibratedDlo) -> tuple[str, ...]:
     return tuple(
-        f'{name}, {BY_NAME[name].quantity}: {_said(dlo.space, name, estimate.value)} '
+        f'{name}, {BY_NAME[name].quantity}: {_said(dlo.space, estimate)} '
         f'({_interval(dlo.space, name, estimate.lower, estimate.upper)}), '
         f'{estimate.verdict or "verdict unknown"}'
         for name, estimate in dlo.parameters.items())
@@ -225,7 +226,7 @@ def _undetermined(dlo: CalibratedDlo) -> list[str]:
     """Return a warning for each parameter that the trials do not determine, with its interval."""
     return [f'{name} is not identifiable: the trials allow '
             f'{_interval(dlo.space, name, estimate.lower, estimate.upper)}; '
-            f'{_said(dlo.space, name, estimate.value)} is used'
+            f'{_said(dlo.space, estimate)} is used'
             for name, estimate in dlo.parameters.items() if estimate.verdict == NOT_IDENTIFIABLE
             or not estimate.verdict and not estimate.identifiable]
 
@@ -251,8 +252,10 @@ def _about_table(level: float | None, radius: float, options: Options) -> list[s
             'touches it where it was seen']
 
 
-def _said(space: ParameterSpace, name: str, value: float) -> str:
-    return measured(*space.reported(name, value))
+def _said(space: ParameterSpace, estimate: ParameterEstimate) -> str:
+    """Return a value for people, as it is written beside its interval."""
+    value, unit = space.reported(estimate.name, estimate.value)
+    return measured(value, unit, estimate.physical_upper)
 
 
 def _interval(space: ParameterSpace, name: str, lower: float, upper: float) -> str:

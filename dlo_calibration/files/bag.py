@@ -25,23 +25,23 @@ from dlo_calibration.messages.codec import INITIAL, INPUT_TYPES, NANOSECONDS, OU
 USED_TYPES: Mapping[str, str] = {**INPUT_TYPES, **OUTPUT_TYPES}
 
 KEPT_MESSAGES = 300_000  # nearly three hours of a tracker at 30 Hz
-KEPT_OCTETS = 200 * 10**6  # of them; a tracker's chain of 21 points has 700 bytes
-KEPT_OF_ANY = 20_000  # of a file of any size; of more, each takes MESSAGE_OCTETS at least
+KEPT_OCTETS = 200 * 10**6  # bytes of kept messages; a tracker's chain of 21 points has 700
+KEPT_OF_ANY = 20_000  # messages of a file of any size; a larger file may have one per MESSAGE_OCTETS
 UNPACKED_OCTETS = 2 * 10**9  # of all messages, or UNPACKED_RATIO times the files: images pack 10 to 1
 UNPACKED_RATIO = 100
 MESSAGES_OF_ANY = 200_000  # of all topics, likewise
-MESSAGE_OCTETS = 16  # of a file, for each message: its stamp, its entry in an index
-NAMED_TOPICS = 10  # of those that are left out
+MESSAGE_OCTETS = 16  # least bytes of a file for each message: its stamp, its entry in an index
+NAMED_TOPICS = 10  # left-out topics that the warnings name
 NAME_LENGTH = 255  # of a topic or a type, as ROS allows
 OPTIONS_SIZE = 10**5  # characters of recorded options; ours have 2000
 AT_ONCE = 128 * 2**20  # bytes: rosbag2's chunks have one megabyte, or one message where that is larger
 PIECE = 2**20  # bytes that are in memory while a file is unpacked
 ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'  # begins every frame; a CDR message begins with a zero
-DISCARD = re.compile(r'discard (\d{1,19}) (\d{1,19})')  # the mark of a trial that is discarded: its stamps
+DISCARD = re.compile(r'discard (\d{1,19}) (\d{1,19})')  # mark of a discarded trial: its first and last stamp
 
 
 class LimitExceeded(Exception):
-    """More comes out of a recording than any real one contains."""
+    """A recording contains more than any real one."""
 
 
 class Bag:
@@ -50,7 +50,7 @@ class Bag:
 
     :param records: the messages on topics that this package uses, as they came.
     :param counts: number of messages by (topic, type), also of those that are not kept.
-    :param problems: one text for each defect.
+    :param warnings: one text for each defect.
     :param remap: topic -> name of the input topic as which it is read.
     """
 
@@ -58,9 +58,9 @@ class Bag:
         self.remap = remap
         self.records: list[Record] = []
         self.counts: Counter[tuple[str, str]] = Counter()
-        self.problems: list[str] = []
+        self.warnings: list[str] = []
         self._first, self._last = 2**64, -2**64  # log times of all messages [ns]
-        self._kept = 0
+        self._octets = 0  # bytes of `records`
         self._size = 0
         self._messages = 0
         self._unpacked = 0
@@ -98,23 +98,23 @@ class Bag:
             raise LimitExceeded(f'it has more than {self._messages - 1} messages in {self._size} bytes')
 
     def keep(self, record: Record) -> None:
-        """Keep a message; what the node sent takes at most half of the room."""
+        """Keep a message; the outputs of the node take at most half of the room."""
         limit = min(KEPT_MESSAGES, max(KEPT_OF_ANY, self._size // MESSAGE_OCTETS))
         if record.type in OUTPUT_TYPES.values() and (
-                2 * len(self.records) >= limit or 2 * self._kept > KEPT_OCTETS):
+                2 * len(self.records) >= limit or 2 * self._octets > KEPT_OCTETS):
             return
-        self._kept += len(record.data)
-        if len(self.records) >= limit or self._kept > KEPT_OCTETS:
+        self._octets += len(record.data)
+        if len(self.records) >= limit or self._octets > KEPT_OCTETS:
             raise LimitExceeded(f'it has more than {limit} messages or {KEPT_OCTETS / 1e6:.0f} MB '
                                 'on the topics of the calibrator')
         self.records.append(replace(record, stands_for=self.remap.get(record.topic, '')))
 
     def leave_out(self, topic: str, encoding: str) -> None:
-        """Report that a topic is not read, as its messages are not encoded as CDR."""
+        """Warn that a topic is not read, because its messages are not CDR."""
         if topic in self._left_out or len(self._left_out) > NAMED_TOPICS:
             return
         self._left_out.add(topic)
-        self.problems.append(f'topic {topic} is left out: its messages are {encoding!r}, not cdr'
+        self.warnings.append(f'topic {topic} is left out: its messages are {encoding!r}, not cdr'
                              if len(self._left_out) <= NAMED_TOPICS else 'more topics are left out likewise')
 
     def uses(self, topic: str, kind: str) -> bool:
@@ -130,18 +130,18 @@ class Bag:
             self._dropped = entries['dropped']
 
     def options(self) -> dict[str, Any] | None:
-        """Return the last recorded options, as they stand there; None: none were recorded."""
+        """Return the last recorded options, unchecked; None if none were recorded."""
         if self._options is None:
             return None
         with suppress(ValueError, RecursionError):
             options = json.loads(self._options[:OPTIONS_SIZE])
             if isinstance(options, dict):
                 return options
-        self.problems.append('recorded options that cannot be read are left out')
+        self.warnings.append('recorded options that cannot be read are left out')
         return None
 
     def dropped(self) -> list[str]:
-        """Return a text for each kind of message of which the recording node dropped some."""
+        """Return a warning for each kind of message that the recording node dropped."""
         try:
             counts = json.loads(self._dropped)
             return [f'{int(counts[kind])} {kind} message(s) came faster than the node could read them, '
@@ -153,8 +153,8 @@ class Bag:
         """
         Return the inputs that the last calibration used, or all where none was started.
 
-        Inputs before a reset are left out, unless none came after it, and those of discarded trials; the
-        problems say how many.
+        The inputs before a reset are left out, unless none follow it, and those of discarded trials; the
+        warnings give their numbers.
         """
         inputs = list(inputs)
         places = {id(record): place for place, record in enumerate(self.records)}
@@ -164,14 +164,14 @@ class Bag:
                    default=len(self.records))
         used = [record for record in inputs if first <= places[id(record)] < last]
         if len(used) < len(inputs):
-            self.problems.append(f'{len(inputs) - len(used)} message(s) before the last reset or after the '
+            self.warnings.append(f'{len(inputs) - len(used)} message(s) before the last reset or after the '
                                  'last start are left out, as the live calibration did not use them')
         discards = [(int(match[1]), int(match[2])) for mark, place in self._marks
                     if first <= place < last and (match := DISCARD.fullmatch(mark))]
         if not discards:
             return used
         discarded = _discarded(used, discards)
-        self.problems.append(f'{len(discarded)} message(s) of {len(discards)} trial(s) that were taken back '
+        self.warnings.append(f'{len(discarded)} message(s) of {len(discards)} trial(s) that were taken back '
                              'are left out')
         return [record for k, record in enumerate(used) if k not in discarded]
 
@@ -185,7 +185,7 @@ def _discarded(records: list[Record], discards: Iterable[tuple[int, int]]) -> se
     """
     stamped = []
     for k, record in enumerate(records):
-        with suppress(InputError):  # one that does not decode is reported later
+        with suppress(InputError):  # decoding again reports it later
             stamp = decode(record).header.stamp
             stamped.append((stamp.sec * NANOSECONDS + stamp.nanosec, record.name != INITIAL, k))
     stamped.sort()
@@ -210,7 +210,7 @@ def unpacked(packed: bytes, compression: str, size: int) -> bytes:
     Return the content of a chunk.
 
     :param compression: as MCAP names it: empty, ``zstd`` or ``lz4``.
-    :param size: of the content [bytes], as announced; more is never made of it.
+    :param size: of the content [bytes], as announced; no more is unpacked.
     :raises Exception: of any kind, where it is damaged, or has another size.
     """
     content = packed
@@ -229,16 +229,16 @@ def unpacked(packed: bytes, compression: str, size: int) -> bytes:
 
 def unpacked_message(octets: bytes, allow: Callable[[int], None]) -> bytes:
     """
-    Return the CDR bytes of a message, which rosbag2 may have compressed alone; damaged ones unchanged.
+    Return the CDR bytes of a message, which rosbag2 may have compressed; damaged bytes unchanged.
 
-    :param allow: called with the number of bytes that unpacking makes; raises where they are too many.
+    :param allow: called with the number of unpacked bytes; raises where they are too many.
     """
     if octets[:4] != ZSTD_MAGIC:
         return octets
     import zstandard
 
     size, content = zstandard.CONTENTSIZE_UNKNOWN, octets
-    with suppress(Exception):  # damaged bytes can raise anything; that they do not decode is said later
+    with suppress(Exception):  # damaged bytes can raise anything; decoding reports them later
         size = zstandard.get_frame_parameters(octets).content_size
         content = _zstd(octets, min(size, AT_ONCE))
     unpacked_whole = size == zstandard.CONTENTSIZE_UNKNOWN and content is not octets
@@ -263,7 +263,7 @@ def unpack_file(packed: Path, target: Path, allow: Callable[[int], None]) -> Non
 def _zstd(packed: bytes, size: int) -> bytes:
     import zstandard
 
-    # The library believes the frame's own announcement, and asks for that much memory.
+    # The library allocates the memory that the frame announces.
     declared = zstandard.get_frame_parameters(packed).content_size
     if declared not in (size, zstandard.CONTENTSIZE_UNKNOWN):
         raise ValueError('its size is not as announced')

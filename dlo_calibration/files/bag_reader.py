@@ -13,7 +13,7 @@ from dlo_calibration.files.bag import Bag, LimitExceeded, unpack_file
 from dlo_calibration.files.mcap_file import McapFile
 from dlo_calibration.files.recording import METADATA_FILE, METADATA_KEY
 from dlo_calibration.files.sqlite_file import read_sqlite
-from dlo_calibration.reading import read_first, require_file
+from dlo_calibration.reading import parse_yaml, require_file
 from dlo_calibration.writing import scratch_folder
 
 SUFFIXES = ('.mcap', '.db3', '.zstd')  # of recordings in a folder
@@ -64,7 +64,7 @@ def _read_folder(path: Path, bag: Bag) -> None:
             refusals.append(error)
     if len(refusals) == len(files):
         raise refusals[0]
-    bag.problems.extend(map(str, refusals))
+    bag.warnings.extend(map(str, refusals))
 
 
 def _files(path: Path, bag: Bag) -> list[Path]:
@@ -74,19 +74,19 @@ def _files(path: Path, bag: Bag) -> list[Path]:
     try:
         why = _unreadable(file)
         if why:
-            bag.problems.append(f'{METADATA_FILE}: {why}')
+            bag.warnings.append(f'{METADATA_FILE}: {why}')
         else:
             names = _recordings(file)
     except OSError:
         raise
     except Exception:  # damaged YAML can raise anything
-        bag.problems.append(f'{METADATA_FILE} cannot be read; all recordings in the folder are read instead')
+        bag.warnings.append(f'{METADATA_FILE} cannot be read; all recordings in the folder are read instead')
     return [path / name for name in dict.fromkeys(names)] or sorted(
         file for file in path.iterdir() if file.suffix in SUFFIXES)
 
 
 def _read_file(path: Path, file: Path, bag: Bag) -> None:
-    """Read one recording; a defect becomes a problem, or an error where nothing was read."""
+    """Read one recording; a defect becomes a warning, or an error where nothing was read."""
     records, messages = len(bag.records), sum(bag.counts.values())
     try:
         if file.suffix == '.zstd':  # rosbag2 compressed it as a whole
@@ -110,11 +110,11 @@ def _read_file(path: Path, file: Path, bag: Bag) -> None:
     if sum(bag.counts.values()) == messages:
         raise _unusable(path, f'a file without a readable message ({text.partition(";")[0]})', EXPECTED,
                         'name another file, or record it again')
-    bag.problems.append(text)
+    bag.warnings.append(text)
 
 
 def _read_unpacked(path: Path, file: Path, bag: Bag) -> None:
-    """Read a recording at `path`, which is or was unpacked from a file of the session."""
+    """Read a recording at `path`: a file of the session, or its unpacked content."""
     if path.suffix == '.db3':
         read_sqlite(path, file, bag)
         return
@@ -123,7 +123,7 @@ def _read_unpacked(path: Path, file: Path, bag: Bag) -> None:
 
 
 def _unreadable(file: Path) -> str:
-    """Return why a file of a folder is not to be read, if there is a reason."""
+    """Return why a file of a folder must not be read; empty if it may."""
     if file.is_symlink() and file.resolve().parent != file.parent.resolve():
         return 'it is left out, as it is a link out of the folder; name the file it leads to'
     if not file.exists():
@@ -132,12 +132,12 @@ def _unreadable(file: Path) -> str:
 
 
 def _recordings(file: Path) -> list[str]:
-    """Return the names of the recordings in a metadata.yaml; its damages can raise anything."""
+    """Return the names of the recordings in a metadata.yaml; a damaged file can raise anything."""
     with file.open('rb') as stream:
         octets = stream.read(METADATA_SIZE + 1)
     if len(octets) > METADATA_SIZE:
         raise ValueError('too large')
-    whole = read_first(octets)
+    whole = parse_yaml(octets)
     names = whole[METADATA_KEY].get('relative_file_paths') or []
     if not isinstance(names, list):
         raise ValueError('no list of files')

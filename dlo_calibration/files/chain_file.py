@@ -10,14 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from dlo_calibration.errors import InputError
-from dlo_calibration.files.xml import (
-    add_points,
-    document,
-    new_root,
-    parse,
-    read_chain,
-    read_octets,
-)
+from dlo_calibration.files.xml import add_points, document, new_root, parse, read_chain, read_octets
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.parameters import exact
 from dlo_calibration.writing import write_file

@@ -4,13 +4,13 @@
 """
 MCAP file: read record by record, around damaged places.
 
-A wrong bit costs at most the messages of the chunk that it is in.  A file is a chain of records: kind,
-length, content; one wrong length would hide all that follows.  The contents have lengths of their own, so
-that a record can be checked by its form, and the next one is found by searching for a record in good form.
+A wrong bit costs at most the messages of its chunk.  A file is a chain of records: kind, length, content;
+a wrong length would hide all later records.  The contents have lengths of their own, so the form of a record
+can be checked; after damage, reading goes on at the next record in good form.
 
-Records are read by hand, as the reader of the library mcap ends at the first damaged place, unpacks a chunk
-to whatever size its compressed bytes say, and lists all messages of a chunk before it gives the first one;
-its limit bounds only the size of a record in the file.
+The reader of the library mcap would stop at the first damaged place, unpack a chunk to any size that its
+compressed bytes declare, and list all messages of a chunk before it yields the first; its limit bounds only
+the size of a record in the file.
 
 The format is specified at https://mcap.dev/spec.
 """
@@ -41,8 +41,8 @@ HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX, ATT
 HEAD = struct.Struct('<BQ')  # of every record: its kind, and the length of its content
 MESSAGE_HEAD = struct.Struct('<HIQQ')  # channel, sequence, log time, publish time
 
-#: Content of each kind of record: numbers of bytes, and I or Q where a length of that type, with so
-#: many bytes after it, stands.  What follows the head of a message fills it.
+#: Content of each kind of record: numbers of bytes; I or Q: a length of that type, then that many bytes.
+#: The data of a message follow its head.
 FORMS: dict[int, tuple[int | str, ...]] = {
     HEADER: ('I', 'I'), FOOTER: (20,), SCHEMA: (2, 'I', 'I', 'I'), CHANNEL: (4, 'I', 'I', 'I'),
     MESSAGE: (MESSAGE_HEAD.size,), CHUNK: (28, 'I', 'Q'), MESSAGE_INDEX: (2, 'I'),
@@ -56,7 +56,7 @@ WINDOW = 2**20  # bytes that are searched at once
 CANDIDATES = 1_000_000  # places that are checked in one file: a second or two
 DESCRIPTION_SIZE = 2**20  # bytes read of a channel, a schema or one of our own records: names and options
 CHUNK_HEAD = struct.Struct('<QQQII')  # times of the first and last message, size, CRC, length of a name
-NAMED_PLACES = 3  # damaged ones, in a problem
+NAMED_PLACES = 3  # damaged places that a warning names
 
 
 class McapRecords:
@@ -77,7 +77,7 @@ class McapRecords:
         return self._stream.read(count)
 
     def head(self, place: int) -> tuple[int, int] | None:
-        """Return kind and length of the record at a place; None where none can be."""
+        """Return kind and length of the record at a place; None if no record can begin there."""
         octets = self.bytes_at(place, HEAD.size)
         if len(octets) < HEAD.size:
             return None
@@ -90,9 +90,9 @@ class McapRecords:
 
     def surplus(self, place: int, kind: int, length: int) -> int | None:
         """
-        Return how many bytes a record has after the content that its kind needs.
+        Return how many bytes a record has beyond the form of its kind; None if it lacks this form.
 
-        It is 0 for every record of today's format, except messages; None: it is not in the form of its kind.
+        Every record of today's format has 0, except messages.
         """
         at, stop = place + HEAD.size, place + HEAD.size + length
         for part in FORMS.get(kind, ()):
@@ -134,10 +134,10 @@ class McapRecords:
 
 class McapFile:
     """
-    An MCAP file, and what was read of it.
+    An MCAP file, and its content read so far.
 
     :param size: of the stream [bytes].
-    :param name: of the file, for the descriptions of problems.
+    :param name: of the file, for warnings.
     :param bag: takes the messages, and the entries of our own metadata records.
     """
 
@@ -150,16 +150,16 @@ class McapFile:
         self._channels: dict[int, tuple[str, str, str]] = {}  # topic, type and encoding of each
         self._promised: int | None = None  # number of messages by the file's statistics
         self._messages = 0
-        self._strange: set[int] = set()  # channels that are not described
+        self._undescribed: set[int] = set()  # channels without a description
         self._damage: list[str] = []  # the first damaged places
         self._damaged = 0
 
     def read(self) -> None:
         """
-        Read all that can be read; what cannot is described in the problems of the bag.
+        Read all readable messages; the warnings of the bag describe the damage.
 
         :raises ValueError: where it is no MCAP file.
-        :raises LimitExceeded: where more comes out of it than of any real recording.
+        :raises LimitExceeded: where it contains more than any real recording.
         """
         if self._form.bytes_at(0, len(MAGIC)) != MAGIC:
             if not self._form.sound(len(MAGIC)):
@@ -170,7 +170,7 @@ class McapFile:
         try:
             self._read_records()
         except LimitExceeded:
-            self._promised = None  # what is missing then is not damaged
+            self._promised = None  # messages are missing then without damage
             raise
         finally:
             self._describe()
@@ -223,7 +223,7 @@ class McapFile:
                 following = place + HEAD.size + length
                 whole = surplus == 0 and kind != MESSAGE
                 resumed = following if whole or form.sound(following) else form.next_sound(place + 1)
-                # A sound one behind the following place: this length is right, the following record damaged.
+                # A sound record after the following one: only the following one is damaged.
                 if whole or resumed is not None and resumed >= following:
                     yield place, kind, length
                 if whole and kind in (DATA_END, FOOTER):
@@ -243,7 +243,7 @@ class McapFile:
         try:
             if length > AT_ONCE or size > AT_ONCE:
                 raise ValueError(f'more than {AT_ONCE} bytes at once')
-            self._bag.unpack(size)  # before, as one that turns out to be damaged takes as long
+            self._bag.unpack(size)  # counted first: a damaged chunk takes as long
             compression = self._form.bytes_at(at, name).decode()
             content = unpacked(self._form.bytes_at(at + name + 8, length - CHUNK_HEAD.size - name - 8),
                                compression, size)
@@ -258,15 +258,15 @@ class McapFile:
         if not self._read_content(McapRecords(BytesIO(content), size), crc != 0):
             self._note(f'records in the chunk at byte {place}')
 
-    def _read_content(self, form: McapRecords, sure: bool) -> bool:
-        """Read the records of a chunk; return whether they fill it. `sure`: it had a checksum."""
+    def _read_content(self, form: McapRecords, verified: bool) -> bool:
+        """Read the records of a chunk; return whether they fill it.  `verified`: it had a checksum."""
         place = 0
         while (head := form.head(place)) is not None:
             kind, length = head
             if kind == MESSAGE and length >= MESSAGE_HEAD.size:
                 self._read_message(form, place, length)
             elif kind in (SCHEMA, CHANNEL):
-                self._describe_topic(kind, form.description(place, length), sure)
+                self._describe_topic(kind, form.description(place, length), verified)
             elif kind in FORMS:  # others are not allowed in a chunk; unknown ones are
                 return False
             place += HEAD.size + length
@@ -278,7 +278,7 @@ class McapFile:
         number, _, log_time, _ = MESSAGE_HEAD.unpack(form.bytes_at(at, MESSAGE_HEAD.size))
         self._messages += 1
         if number not in self._channels:
-            self._strange.add(number)
+            self._undescribed.add(number)
             return
         topic, name, encoding = self._channels[number]
         if encoding != 'cdr':
@@ -292,11 +292,11 @@ class McapFile:
         octets = form.bytes_at(at + MESSAGE_HEAD.size, length - MESSAGE_HEAD.size)
         self._bag.keep(Record(topic, name, unpacked_message(octets, self._bag.unpack), log_time))
 
-    def _describe_topic(self, kind: int, content: bytes, sure: bool = False) -> None:
+    def _describe_topic(self, kind: int, content: bytes, verified: bool = False) -> None:
         """
-        Take a schema or a channel; of two with one number, one that is not damaged.
+        Add a schema or a channel; of two with the same number, the undamaged one counts.
 
-        :param sure: it had a checksum; else, the one that this package uses is taken for undamaged.
+        :param verified: it had a checksum; without one, the description that this package uses counts.
         """
         try:
             if kind == SCHEMA:
@@ -305,8 +305,8 @@ class McapFile:
                 if len(name) > NAME_LENGTH:
                     raise ValueError('a name that is too long')
                 names = self._schemas.get(number, [])
-                if sure or name not in names and len(names) < 2:
-                    self._schemas[number] = [name] if sure else [*names, name]
+                if verified or name not in names and len(names) < 2:
+                    self._schemas[number] = [name] if verified else [*names, name]
                 return
             number, schema = struct.unpack_from('<HH', content)
             topic, at = _text(content, 4)
@@ -319,7 +319,7 @@ class McapFile:
         names = self._schemas.get(schema, [''])
         used = [name for name in names if self._wanted(topic, name, encoding)]
         new = number not in self._channels
-        if new or sure or used and not self._wanted(*self._channels[number]):
+        if new or verified or used and not self._wanted(*self._channels[number]):
             self._channels[number] = topic, [*used, *names][0], encoding
             if encoding != 'cdr' and new:
                 self._bag.leave_out(topic, encoding)
@@ -328,7 +328,7 @@ class McapFile:
         return encoding == 'cdr' and self._bag.uses(topic, name)
 
     def _read_metadata(self, content: bytes) -> None:
-        """Pass the entries of a record of our own on."""
+        """Give the entries of one of our own metadata records to the bag."""
         try:
             name, at = _text(content, 0)
             if name != OUR_RECORD:
@@ -354,16 +354,16 @@ class McapFile:
             self._note('its checksum differs')
 
     def _describe(self) -> None:
-        """Describe in one problem what is damaged or missing."""
-        if self._strange:
-            self._note(f'messages of {len(self._strange)} topic(s) without a description')
+        """Describe in one warning what is damaged or missing."""
+        if self._undescribed:
+            self._note(f'messages of {len(self._undescribed)} topic(s) without a description')
         missing = (self._promised or 0) - self._messages
         if not self._damage and missing <= 0:
             return
         places = '; '.join(self._damage) or 'messages are missing'
         more = self._damaged - NAMED_PLACES
         count = f'{self._messages} of its {self._promised}' if missing > 0 else f'{self._messages}'
-        self._bag.problems.append(
+        self._bag.warnings.append(
             f'{self._name} is cut or damaged ({places}{f"; and {more} more" if more > 0 else ""}); '
             f'{count} message(s) were read')
 

@@ -23,7 +23,7 @@ class Record:
     :param type: full name, ``package/msg/Type``.
     :param data: CDR bytes, with the encapsulation header.
     :param log_time: time of the recording [ns].
-    :param stands_for: the input topic as which the user wants it to be read; empty: its own name counts.
+    :param stands_for: the input topic as which the user reads it; empty: its own name counts.
     """
 
     topic: str

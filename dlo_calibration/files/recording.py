@@ -19,7 +19,7 @@ from textwrap import indent
 import time
 from typing import Any, BinaryIO, cast, Iterable, Iterator, Mapping
 
-import mcap  # noqa: F401  # required; its writer takes long to load, and who only reads needs none
+import mcap  # noqa: F401  # required; its writer is slow to load, and reading does not need it
 from ruamel.yaml import YAML
 
 from dlo_calibration.calibration.options import recordable
@@ -42,13 +42,13 @@ class SessionWriter:
     Writes a session into a new rosbag2 folder.
 
     No file is overwritten: where `path` exists, the folder is called ``path_2``,
-    ``path_3``, ...  Each message is given to the operating system before `write`
-    returns, so a killed process loses no message that it has written.
+    ``path_3``, ...  `write` returns when the operating system has the message, so a killed
+    process loses none.
 
     :param path: the folder to create, or, if it ends in ``.mcap``, a single file
         without folder and metadata.yaml; parent folders are created too.
     :param options: as for `write_options`; None: written later or never.
-    :ivar failure: why nothing can be written any more; empty: it can.
+    :ivar failure: why nothing more can be written; empty while writing works.
     :raises RecordingError: here and in every method, where writing fails.
         Nothing is written after the first such error.
     """
@@ -114,14 +114,14 @@ class SessionWriter:
 
     def write_mark(self, mark: str) -> None:
         """
-        Record what decides which messages a result uses.
+        Record a mark, by which `Bag.used` selects the messages of a result.
 
         :param mark: ``start`` of a calibration, or ``reset``, which forgets the trials; see `write_discard`.
         """
         self._write_metadata_record('mark', mark)
 
     def write_discard(self, first: int, last: int) -> None:
-        """Record that a trial is discarded, whose messages are stamped from `first` to `last` [ns]."""
+        """Record that the trial with messages stamped from `first` to `last` [ns] is discarded."""
         self.write_mark(f'discard {first} {last}')
 
     def write_dropped(self, counts: Mapping[str, int]) -> None:
@@ -204,10 +204,10 @@ class SessionWriter:
             'custom_data': {}, 'ros_distro': 'jazzy'})
 
     def _write_metadata_file(self) -> None:
-        """Replace metadata.yaml at once, so that it is never incomplete."""
+        """Replace metadata.yaml as a whole, so that it is never incomplete."""
         if self.file == self.path:
             return
-        # Without waiting for the disk, as the node calls this while it listens.
+        # The node calls this while it listens, so it does not wait for the disk.
         with replacing(self.path / METADATA_FILE, fsync=False) as new:
             new.write_text(f'{METADATA_KEY}:\n{indent(self._metadata(), "  ")}\n', encoding='utf-8')
 

@@ -11,16 +11,15 @@ starts from the latest observed chain before it: the initial one, or a goal chai
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 import re
-from types import MappingProxyType
-from typing import Any, Mapping, Union
+from typing import Any, Union
 
 import numpy as np
 
-from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.options import FileOptions, Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.files import xml
 from dlo_calibration.model.action import Action, Hand, MAXIMUM_TIME, NO_ROTATION, PATHS
@@ -94,7 +93,7 @@ class TrialRequest:
         return cls(trial.name, trial.initial, trial.actions, goals, trial.velocity)
 
     def moved(self, pose: Pose) -> TrialRequest:
-        """Return the trial in the table's frame, in which the frame of the request has a pose."""
+        """Return the trial in the table's frame, where `pose` is that of the request's frame."""
         return replace(
             self, initial=pose.chain(self.initial), actions=tuple(
                 pose.action(action) if isinstance(action, Action) else pose.named_action(action)
@@ -160,7 +159,7 @@ class TrialRequest:
         return sorted(self.actions, key=lambda action: action.start)
 
     def _seen(self, time: float) -> Chain:
-        """Return the latest chain that was observed until a time [s]."""
+        """Return the latest chain observed no later than a time [s]."""
         seen = [goal for goal in self.goals if goal.time <= time]
         return max(seen, key=lambda goal: goal.time).chain if seen else self.initial
 
@@ -170,31 +169,27 @@ class Request:
     """
     The object, settings and trials of a calibration.
 
-    :param options: the given options, by name, including the mass [kg] if it is known.
-    :param name: name of the object.
-    :param problems: a text for each option in the file that is left out.
-    :param refusal: why the scene in the file is not among the options.
+    :param file_options: the given options, including the mass [kg] if it is known.
+    :param name: of the object.
     """
 
     trials: tuple[TrialRequest, ...]
-    options: Mapping[str, Any] = field(default_factory=dict)
+    file_options: FileOptions = FileOptions()
     name: str | None = None
-    problems: tuple[str, ...] = ()
-    refusal: InputError | None = None
 
     def __post_init__(self) -> None:
         if not self.trials:
             raise InputError(WHAT, 'no trial', 'at least one', 'add a trial')
-        Options.of(self.options)
+        Options.of(self.file_options.values)
         object.__setattr__(self, 'trials', tuple(self.trials))
-        object.__setattr__(self, 'options', MappingProxyType(dict(self.options)))
 
     @cached_property
     def document(self) -> bytes:
         """The request as an XML document in UTF-8."""
         root = xml.new_root('calibration_request', version=1)
-        settings = {name: value for name, value in self.options.items() if name != 'mass'}
-        xml.add(root, 'object', name=self.name, mass=self.options.get('mass'))
+        options = self.file_options.values
+        settings = {name: value for name, value in options.items() if name != 'mass'}
+        xml.add(root, 'object', name=self.name, mass=options.get('mass'))
         xml.add_options(root, 'settings', settings)
         for trial in self.trials:
             element = xml.add(root, 'trial', name=trial.name)
@@ -207,7 +202,7 @@ class Request:
                 _add_action(element, action)
             for goal in trial.goals:
                 xml.add_points(xml.add(element, 'goal_chain', time=goal.time, stable=goal.stable,
-                               held_by=goal.held_by), goal.chain)
+                                       held_by=goal.held_by), goal.chain)
         return xml.document(root)
 
 
@@ -251,8 +246,8 @@ def request_of(octets: bytes, where: str = WHAT, folder: Path | None = None) -> 
         with xml.located(where, of_object):
             Options.of({'mass': options['mass']})
     with xml.located(where, settings):
-        return Request(tuple(_trial(where, trial) for trial in trials), options, of_object.get('name'),
-                       given.problems, given.refusal)
+        return Request(tuple(_trial(where, trial) for trial in trials), replace(given, values=options),
+                       of_object.get('name'))
 
 
 def request_trials(request: Request, options: Options) -> tuple[tuple[Trial, ...], tuple[str, ...]]:
@@ -294,17 +289,18 @@ def request_manipulations(request: Request, options: Options) -> tuple[Manipulat
 def _add_action(parent: Any, action: Union[NamedAction, Action]) -> None:
     if isinstance(action, NamedAction):
         values = {part.name: getattr(action, part.name) for part in fields(action)}
-        last = {name: values.pop(name) for name in ('start', 'hold')}  # their place in the schema
+        last = {name: values.pop(name) for name in ('start', 'hold')}  # where the schema has them
         xml.add(parent, action.name, **values, **last)
         return
     paths = xml.add(parent, PATHS)
     for hand in action.hands:
-        element = xml.add(paths, 'hand', name=hand.name, grips=hand.grips, offset=hand.offset or None)
+        element = xml.add(paths, 'hand', name=hand.name, grips=hand.grips, offset=hand.offset or None,
+                          nearest=hand.nearest or None)
         turns = (hand.orientations != NO_ROTATION).any(axis=1)
         for time, (x, y, z), turn, turned in zip(hand.times.tolist(), hand.positions.tolist(),
                                                  hand.orientations.tolist(), turns, strict=True):
             xml.add(element, 'waypoint', time=time, x=x, y=y, z=z,
-                **(dict(zip(TURNS, turn, strict=True)) if turned else {}))
+                    **(dict(zip(TURNS, turn, strict=True)) if turned else {}))
 
 
 def _trial(where: str, element: Any) -> TrialRequest:

@@ -11,7 +11,7 @@ mass, and the calibration that found them.  The node publishes it, and result.xm
 from __future__ import annotations
 
 import csv
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, replace
 from itertools import combinations
 import math
 from pathlib import Path
@@ -21,7 +21,6 @@ from typing import Any, Mapping, Sequence
 from dlo_calibration.calibration.choice import DECIDED
 from dlo_calibration.calibration.options import FileOptions
 from dlo_calibration.calibration.result import CalibrationResult, evaluation_rows, ParameterEstimate, plain
-from dlo_calibration.errors import InputError
 from dlo_calibration.files import xml
 from dlo_calibration.inference.examination import Confirmation
 from dlo_calibration.model.chain import Chain
@@ -46,14 +45,12 @@ class Description:
     :param length: mean length of the DLO over the trials [m].
     :param chain: the DLO at rest, before the first trial's action, with its annotations.
     :param correlations: of each pair of found parameters, by name, -1 to 1; None: they are unknown.
-    :param options: options of the calibration, by name; empty where they were not given.
-    :param choice: which parameters `calibrate` auto has chosen, and why; empty where they were named.
+    :param file_options: options of the calibration; none where they were not given.
+    :param choice: the parameters that `calibrate` auto has chosen, and why; empty where they were named.
     :param unusable: why the parameters should not be used, in words; empty: they can be.
     :param trials: names of the trials.
     :param scores: difference score of each trial [cm].
     :param confirmation: fit of a second engine with the same parameters; None: there was no second engine.
-    :param problems: a text for each option in the file that is left out, and one if it should not be used.
-    :param refusal: why the scene in the file is not among the options.
     """
 
     parameters: Mapping[str, ParameterEstimate]
@@ -73,16 +70,14 @@ class Description:
     seconds: float
     stop_reason: str
     correlations: Mapping[str, Mapping[str, float]] | None = None
-    options: Mapping[str, Any] = field(default_factory=dict)
+    file_options: FileOptions = FileOptions()
     choice: str = ''
     unusable: str = ''
     warnings: tuple[str, ...] = ()
     confirmation: Confirmation | None = None
-    problems: tuple[str, ...] = ()
-    refusal: InputError | None = None
 
     def __post_init__(self) -> None:
-        for name in ('parameters', 'fixed', 'options'):
+        for name in ('parameters', 'fixed'):
             object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
 
     @classmethod
@@ -97,14 +92,9 @@ class Description:
             length=result.length, chain=result.trials[0].initial, score=result.best.score,
             trials=tuple(trial.name for trial in result.trials), scores=result.best.scores,
             errors=result.errors, correlations=result.correlations,
-            options={name: decided.get(name, value) if name in DECIDED else value
-                     for name, value in (options or {}).items()},
+            file_options=FileOptions({name: decided.get(name, value) if name in DECIDED else value
+                                      for name, value in (options or {}).items()}),
             warnings=result.warnings, confirmation=result.confirmation, **{key: values[key] for key in HOW})
-
-    @property
-    def file_options(self) -> FileOptions:
-        """The options, with what was left out of them."""
-        return FileOptions(self.options, self.problems, self.refusal)
 
     @property
     def values(self) -> dict[str, float]:
@@ -139,14 +129,14 @@ def description_document(result: CalibrationResult | Description,
         correlations = xml.add(parameters, 'correlations')
         for first, second in combinations(dlo.parameters, 2):
             xml.add(correlations, 'correlation', first=first, second=second,
-                value=dlo.correlations[first][second])
+                    value=dlo.correlations[first][second])
     how = {key: getattr(dlo, key) for key in HOW}
     calibration = xml.add(root, 'calibration', **{key: 'none' if value is None else value
-                                              for key, value in how.items()})
+                                                  for key, value in how.items()})
     _add_fit(calibration, 'fit', dlo, dlo.trials)
     if dlo.confirmation is not None:
         _add_fit(calibration, 'confirmation', dlo.confirmation, dlo.trials)
-    xml.add_options(calibration, 'options', dlo.options)
+    xml.add_options(calibration, 'options', dlo.file_options.values)
     warnings = xml.add(calibration, 'warnings')
     for text in dlo.warnings:
         xml.add(warnings, 'warning', text=text)
@@ -199,15 +189,15 @@ def read_description(octets: bytes | str, where: str = 'dlo_description',
     chain, parameters, calibration = root
     fit, *second, options, warnings = calibration
     given = xml.read_options(where, options, folder)
-    unusable = calibration.get('unusable')
+    if unusable := calibration.get('unusable'):
+        given = replace(given, warnings=(f'do not use this result: {unusable}', *given.warnings))
     with xml.located(where, parameters):
         dlo = Description(
             **xml.attributes(where, root, Description), **xml.attributes(where, calibration, Description),
             **_fit(where, fit, Description), parameters=_estimates(where, parameters),
             fixed=_fixed(where, parameters), correlations=_correlations(where, parameters),
             chain=xml.read_chain(where, chain), trials=tuple(trial.get('name') for trial in fit),
-            options=given.values, refusal=given.refusal,
-            problems=(*([f'do not use this result: {unusable}'] if unusable else []), *given.problems),
+            file_options=given,
             warnings=tuple(warning.get('text') for warning in warnings),
             confirmation=Confirmation(**_fit(where, second[0], Confirmation)) if second else None)
         space = dlo.space
@@ -223,7 +213,7 @@ def _add_fit(calibration: Any, tag: str, fit: Description | Confirmation, trials
     """Add the score and errors of all trials, and the score of each, by the first or a second engine."""
     other = vars(fit) if isinstance(fit, Confirmation) else {}
     element = xml.add(calibration, tag, engine=other.get('engine'), score=fit.score, **asdict(fit.errors),
-                  mean_distance=other.get('mean_distance'), max_distance=other.get('max_distance'))
+                      mean_distance=other.get('mean_distance'), max_distance=other.get('max_distance'))
     for name, score in zip(trials, fit.scores, strict=True):
         xml.add(element, 'trial', name=name, score=score)
 

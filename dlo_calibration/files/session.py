@@ -16,25 +16,13 @@ from functools import cached_property
 import os
 from pathlib import Path
 import sys
-from typing import Any, Iterable, Mapping
-
-import numpy as np
+from typing import Any, Callable, Iterable, Mapping
 
 from dlo_calibration.calibration.options import file_options, FileOptions, Options
 from dlo_calibration.errors import DEFECT, InputError, one_of, safe_line, suggestion
 from dlo_calibration.files.bag_reader import read_bag
 from dlo_calibration.files.record import decode, encode, Record
-from dlo_calibration.messages.codec import (
-    action_trajectory,
-    ActionMessage,
-    bag_types,
-    chain_cloud,
-    GOAL,
-    INPUT_TYPES,
-    Key,
-    Message,
-    read,
-)
+from dlo_calibration.messages.codec import bag_types, built, GOAL, INPUT_TYPES, Key, Message, read, repeats
 from dlo_calibration.messages.collector import StampOrder, TrialCollector, went_back
 from dlo_calibration.messages.encoder import trial_messages
 from dlo_calibration.messages.refusals import counted
@@ -50,9 +38,8 @@ class Session:
     :param inputs: messages of the input topics that decode, in log order: those that the last calibration
         of the session used, or, where none was started, all since the last reset.
     :param records: all recorded messages of the calibrator's topics, also outputs, in log order.
-    :param recorded: the last recorded options, by name, as far as a file may set them; None: there were none.
-    :param problems: one text for each defect that did not prevent reading.
-    :param refusal: why the recorded scene is not among the options.
+    :param file_options: the last recorded options; None: there were none.
+    :param warnings: those of the options, and one text for each defect that did not prevent reading.
     :param counts: number of recorded messages by topic, also of those that other programs use.
     :param duration: time from the first to the last of these [s].
     :param frames: the frame_ids of `inputs`, sorted.
@@ -62,9 +49,8 @@ class Session:
     path: Path
     inputs: tuple[Record, ...]
     records: tuple[Record, ...]
-    recorded: dict[str, Any] | None = None
-    problems: tuple[str, ...] = ()
-    refusal: InputError | None = None
+    file_options: FileOptions | None = None
+    warnings: tuple[str, ...] = ()
     counts: Mapping[str, int] = field(default_factory=dict)
     duration: float = 0.0
     frames: tuple[str, ...] = ()
@@ -94,12 +80,12 @@ class Session:
 
         :raises InputError: where the recorded scene cannot be used.
         """
-        return FileOptions(self.recorded or {}, refusal=self.refusal).options()
+        return (self.file_options or FileOptions()).options()
 
     @cached_property
     def trials(self) -> tuple[Trial, ...]:
         """The complete trials with the recorded options; `session_trials` also returns the refusals."""
-        return session_trials(self, Options.of(self.recorded or {}))[0]
+        return session_trials(self, Options.of((self.file_options or FileOptions()).values))[0]
 
     def outputs(self, name: str) -> tuple[Any, ...]:
         """
@@ -114,22 +100,30 @@ def trial_records(trials: Iterable[Trial], frame_id: str = 'world') -> tuple[Rec
     """Return the records of a session in which a robot does the given trials; see `trial_messages`."""
     types, records = bag_types(), []
     for message in trial_messages(tuple(trials), frame_id):
-        built = action_trajectory(types, message) if isinstance(message, ActionMessage) else \
-            chain_cloud(types, message.chain, message.stamp, message.frame_id)
         name = INPUT_TYPES[message.kind]
-        records.append(Record(f'/calibrator/{message.kind}', name, encode(built, name), message.stamp))
+        octets = encode(built(types, message), name)
+        records.append(Record(f'/calibrator/{message.kind}', name, octets, message.stamp))
     return tuple(records)
 
 
-def session_trials(session: Session, options: Options) -> tuple[tuple[Trial, ...], tuple[str, ...]]:
-    """Return the complete trials of a session, and the reasons why messages are not used, each once."""
+def session_trials(session: Session, options: Options, note: Callable[[str], object] = lambda text: None
+                   ) -> tuple[tuple[Trial, ...], tuple[str, ...]]:
+    """
+    Return the complete trials of a session, and the reasons why messages are not used, each once.
+
+    :param note: called with each sentence about early messages, which are not used and not refused.
+    """
     clocks, refusals = _by_clock(session)
     trials: list[Trial] = []
+    early: list[str] = []
     for messages in clocks:
         collector, refused = _collected(messages, options)
         trials += collector.trials
+        early += collector.take_early()
         refusals += [text for _, text in refused]
-        refusals += [str(problem) for problem in (*collector.problems, *collector.loose_end)]
+        refusals += map(str, (*collector.refusals, *collector.loose_end))
+    for text in counted(early):
+        note(text)
     named = (replace(trial, name=f'trial {k}') for k, trial in enumerate(trials, start=1))
     return tuple(named), counted(refusals)
 
@@ -141,11 +135,11 @@ def session_manipulations(session: Session,
     manipulations: list[Manipulation] = []
     for messages in clocks:
         collector, refused = _collected(messages, options)
-        of_clock, problems = collector.manipulations()
+        of_clock, errors = collector.manipulations()
         manipulations += of_clock
-        judged = {str(problem) for problem in collector.problems}  # `problems` has those that hold here
-        refusals += [text for kind, text in refused if kind != GOAL and text not in judged]
-        refusals += map(str, problems)
+        replaced = set(map(str, collector.refusals))  # by `errors`, which hold without goal chains
+        refusals += [text for kind, text in refused if kind != GOAL and text not in replaced]
+        refusals += map(str, errors)
     named = (replace(manipulation, name=f'trial {k}')
              for k, manipulation in enumerate(manipulations, start=1))
     return tuple(named), counted(refusals)
@@ -167,26 +161,26 @@ def _by_clock(session: Session) -> tuple[list[list[Message]], list[str]]:
             continue
         if order.clock_went_back(content):
             refusals.append(f'{went_back(order.newest, content.stamp)}: '
-                            'what comes after it makes trials of its own')
+                            'later messages make trials of their own')
             order = StampOrder(order)
             clocks.append([])
         order.add(content)
         clocks[-1].append(content)
-    known: dict[Key, Message] = {}
+    earlier: dict[Key, Message] = {}
     for k, messages in enumerate(clocks):
         fresh = [message for message in messages
-                 if message.key not in known or not _same(message, known[message.key])]
+                 if message.key not in earlier or not repeats(message, earlier[message.key])]
         if len(fresh) < len(messages):
             refusals.append(f'{len(messages) - len(fresh)} message(s) after the clock went back repeat '
                             'earlier ones: a recording that was played again is no second observation')
-        known |= {message.key: message for message in messages}
+        earlier |= {message.key: message for message in messages}
         clocks[k] = fresh
     return clocks, refusals
 
 
 def _collected(messages: Iterable[Message],
                options: Options) -> tuple[TrialCollector, list[tuple[str, str]]]:
-    """Collect messages with stamps of message clock; also return the kinds of those refused, and why."""
+    """Collect the messages of one clock; also return the kind of each refused message, and why."""
     collector = TrialCollector(options)
     refusals = []
     # The trials do not depend on the order of arrival.
@@ -197,16 +191,8 @@ def _collected(messages: Iterable[Message],
             refusals.append((message.kind, str(error)))
         except Exception as error:  # a defect of this package must not cost the other messages
             refusals.append((message.kind, f'{message}: could not be used ({error!r}); {DEFECT}'))
-        refusals += [(message.kind, str(refusal))
-                     for refusal in (*collector.take_refusals(), *collector.take_early())]
+        refusals += [(message.kind, str(refusal)) for refusal in collector.take_refusals()]
     return collector, refusals
-
-
-def _same(one: Message, other: Message) -> bool:
-    """Return whether two messages of one kind and stamp have the same content."""
-    a, b = (message.positions if isinstance(message, ActionMessage) else message.chain.observed
-            for message in (one, other))
-    return bool(np.array_equal(a, b, equal_nan=True))
 
 
 def read_session(path: str | Path, namespace: str | None = None, remap: Mapping[str, str] | None = None,
@@ -217,41 +203,42 @@ def read_session(path: str | Path, namespace: str | None = None, remap: Mapping[
     Input topics are recognised by the last part of their name and by their type.
 
     :param namespace: of the input topics, e.g. ``/calibrator``; needed where several namespaces have them.
-    :param remap: topics with other names, and as which input each is read, e.g. ``{'/trackdlo/results_pc':
-        'goal_chain'}``; it then is the only topic of that kind.
-    :param any_topics: a session without any input topic is read, too.
+    :param remap: the input topic as which another topic is read, e.g. ``{'/trackdlo/results_pc':
+        'goal_chain'}``; no other topic is then read as this one.
+    :param any_topics: read a session without any input topic, too.
     :raises InputError: where the session cannot be read, or has none of the input topics.
     """
     path, remap = Path(path), remap or {}
     bag = read_bag(path, remap)
     records = tuple(sorted(bag.records, key=lambda record: record.log_time))
-    recorded, problems = bag.options(), bag.problems
+    recorded, warnings = bag.options(), bag.warnings
     seen = sorted(bag.counts)
     _check_remap(remap, dict(seen))
     try:
-        topics = _input_topics(path, seen, namespace, remap, problems)
+        topics = _input_topics(path, seen, namespace, remap, warnings)
     except InputError as error:
         if not any_topics or not seen or any(INPUT_TYPES.get(topic.rsplit('/', 1)[-1]) == kind
                                              for topic, kind in seen):
             raise
         topics = frozenset()
-        problems.append(f'no topic is one of {", ".join(INPUT_TYPES)}; {error.remedy}')
+        warnings.append(f'no topic is one of {", ".join(INPUT_TYPES)}; {error.remedy}')
     inputs = [record for record in records
               if record.topic in topics and record.type == INPUT_TYPES[record.name]]
-    usable, frames = _checked(bag.used(inputs), problems)
-    problems += bag.dropped()
+    usable, frames = _checked(bag.used(inputs), warnings)
+    warnings += bag.dropped()
     counts: Counter[str] = Counter()
     for (topic, _), count in bag.counts.items():
         counts[topic] += count
-    allowed = file_options(recorded or {}, path if path.is_dir() else path.parent)
-    return Session(path, usable, records, None if recorded is None else dict(allowed.values),
-                   counted(map(safe_line, [*problems, *allowed.problems])), allowed.refusal, counts,
+    options = None if recorded is None else file_options(recorded, path if path.is_dir() else path.parent)
+    if options is not None:
+        warnings += options.warnings
+    return Session(path, usable, records, options, counted(map(safe_line, warnings)), counts,
                    bag.duration, frames,
                    {topic: kind for topic, kind in seen if not bag.uses(topic, kind)})
 
 
 def _checked(records: Iterable[Record],
-             problems: list[str]) -> tuple[tuple[Record, ...], tuple[str, ...]]:
+             warnings: list[str]) -> tuple[tuple[Record, ...], tuple[str, ...]]:
     """Return the messages that decode, and their frame_ids; report the others, once for each topic."""
     good, frames = [], set()
     bad: dict[str, InputError] = {}
@@ -265,7 +252,7 @@ def _checked(records: Iterable[Record],
             continue
         good.append(record)
         frames.add(frame)
-    problems += [f'{error}; and {more[topic]} more of {topic}' if more[topic] else str(error)
+    warnings += [f'{error}; and {more[topic]} more of {topic}' if more[topic] else str(error)
                  for topic, error in bad.items()]
     return tuple(good), tuple(sorted(frames))
 
@@ -283,25 +270,25 @@ def _check_remap(remap: Mapping[str, str], seen: Mapping[str, str]) -> None:
 
 
 def _input_topics(path: Path, seen: Iterable[tuple[str, str]], namespace: str | None,
-                  remap: Mapping[str, str], problems: list[str]) -> frozenset[str]:
+                  remap: Mapping[str, str], warnings: list[str]) -> frozenset[str]:
     """Return the topics to read, at most one for each kind of message; `seen` has topics and their types."""
     candidates: dict[str, list[Record]] = {kind: [] for kind in INPUT_TYPES if kind not in remap.values()}
     for record in (Record(topic, kind, b'', 0) for topic, kind in seen):
         if record.topic in remap:
             continue
         if record.name in remap.values():
-            problems.append(f'topic {record.topic} is left out, as another one is read as {record.name}')
+            warnings.append(f'topic {record.topic} is left out, as another one is read as {record.name}')
             continue
         if record.type == INPUT_TYPES.get(record.name):
             if namespace is None or record.namespace.strip('/') == namespace.strip('/'):
                 candidates[record.name].append(record)
         elif record.name in INPUT_TYPES:
-            problems.append(f'topic {record.topic} is left out: it is a {record.type}, '
+            warnings.append(f'topic {record.topic} is left out: it is a {record.type}, '
                             f'not a {INPUT_TYPES[record.name]}')
     if not (remap or any(candidates.values())):
         held = ', '.join(sorted(f'{topic} ({kind})' for topic, kind in seen)) or 'no messages'
         raise InputError(
-            f'session {path}', f'{held} ({problems[-1]})' if problems else held,
+            f'session {path}', f'{held} ({warnings[-1]})' if warnings else held,
             'at least one of ' + ', '.join(f'{kind} ({text})' for kind, text in INPUT_TYPES.items())
             + ('' if namespace is None else f' in namespace {namespace}'),
             'record these topics, or name others with --remap TOPIC:=goal_chain' if namespace is None else
@@ -314,19 +301,19 @@ def _input_topics(path: Path, seen: Iterable[tuple[str, str]], namespace: str | 
             raise InputError(
                 f'session {path}', f'input topics in the namespaces {", ".join(spaces)}',
                 'one namespace with the three input topics', 'name the namespace to read, or record only one')
-        problems.append(f'topics outside the namespace {complete[0]} are left out')
+        warnings.append(f'topics outside the namespace {complete[0]} are left out')
         candidates = {kind: [r for r in choice if r.namespace == complete[0].rstrip('/')]
-                 for kind, choice in candidates.items()}
+                      for kind, choice in candidates.items()}
     return frozenset([*remap, *(record.topic for choice in candidates.values() for record in choice)])
 
 
 def samples() -> Path:
     """Return the folder of the sample sessions, in the sources or where the package is installed."""
-    beside = Path(__file__).resolve().parents[2] / 'msg_samples'
+    sources = Path(__file__).resolve().parents[2] / 'msg_samples'
     shared = Path('share') / 'dlo_calibration' / 'msg_samples'
     prefixes = [sys.prefix, *os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)]
-    for folder in (beside, *(Path(prefix) / shared for prefix in prefixes if prefix)):
+    for folder in (sources, *(Path(prefix) / shared for prefix in prefixes if prefix)):
         if folder.is_dir():
             return folder
-    raise InputError('samples', 'no folder msg_samples', f'{beside} or $AMENT_PREFIX_PATH/{shared}',
+    raise InputError('samples', 'no folder msg_samples', f'{sources} or $AMENT_PREFIX_PATH/{shared}',
                      'install the package with its samples, or name a session')

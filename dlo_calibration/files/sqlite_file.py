@@ -24,10 +24,10 @@ from dlo_calibration.files.bag import AT_ONCE, Bag, full_name, LimitExceeded, NA
 from dlo_calibration.files.record import Record
 
 DEFINITION = re.compile(r'CREATE\s+(TABLE|UNIQUE\s+INDEX|INDEX)\b', re.IGNORECASE)
-COMPUTED = re.compile(r'\b(AS|ROWID)\b', re.IGNORECASE)  # in each view and generated column; not in rosbag2's
+COMPUTED = re.compile(r'\b(AS|ROWID)\b', re.IGNORECASE)  # in all views and generated columns, not rosbag2's
 DEFINITION_LENGTH = 10_000  # characters of a definition, or of a topic; rosbag2's have a few hundred
 MOST_TOPICS = 10_000
-PAGES = 100  # damaged ones that are gone around; more are hardly a recording
+PAGES = 100  # damaged pages that are skipped; a file with more is hardly a recording
 STEPS = 10**7  # of SQLite's machine for a file of any size: a second or two
 STEPS_PER_BYTE = 4  # of a larger file: a message takes 50 steps, and 16 bytes at least
 STEPS_AT_ONCE = 10**5  # between two calls of Python, which looks at signals
@@ -35,12 +35,12 @@ STEPS_AT_ONCE = 10**5  # between two calls of Python, which looks at signals
 
 def read_sqlite(path: Path, file: Path, bag: Bag) -> None:
     """
-    Read all messages that can be read; what cannot is described in the problems of the bag.
+    Read all readable messages; the warnings of the bag describe the damage.
 
-    :param file: of the session, which `path` is or was unpacked from; problems and errors name it.
+    :param file: of the session, for warnings and errors; `path` is this file, or its unpacked content.
     :raises sqlite3.Error: where it is no database of rosbag2.
     :raises InputError: where it defines anything to be evaluated.
-    :raises LimitExceeded: where more comes out of it than of any real recording.
+    :raises LimitExceeded: where it contains more than any real recording.
     """
     size = path.stat().st_size
     bag.open(size)
@@ -50,7 +50,7 @@ def read_sqlite(path: Path, file: Path, bag: Bag) -> None:
         connection.text_factory = lambda octets: octets.decode(errors='replace')
         connection.set_progress_handler(lambda: next(calls) > most, STEPS_AT_ONCE)
         connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, DEFINITION_LENGTH)
-        if _whole(path):  # SQLite takes the pages that a cut file lacks for zeros then
+        if _whole(path):  # in a cut file, it would read missing pages as zeros
             connection.execute('PRAGMA writable_schema = ON')  # reads on where an index is damaged
         try:
             _require_plain_tables(connection, file)
@@ -115,14 +115,14 @@ def _read_messages(connection: sqlite3.Connection, topics: dict[int, tuple[str, 
         if isinstance(octets, bytes):
             bag.keep(Record(topic, kind, unpacked_message(octets, bag.unpack), log_time))
     if damaged:
-        bag.problems.append(f'{name} is cut or damaged (in {damaged} or more places); '
-                               f'{messages} message(s) were read')
+        bag.warnings.append(f'{name} is cut or damaged (in {damaged} or more places); '
+                            f'{messages} message(s) were read')
 
 
 def _rows(connection: sqlite3.Connection, wanted: list[int]
           ) -> Iterator[tuple[int | None, int | None, bytes | None] | None]:
     """
-    Yield number of the topic, time, and bytes if the topic is wanted, of each message.
+    Yield for each message its topic's number, its time, and its bytes if the topic is wanted.
 
     None stands for a damaged page, whose messages are missing.
     """
@@ -152,7 +152,7 @@ def _rows(connection: sqlite3.Connection, wanted: list[int]
 def _after(connection: sqlite3.Connection, query: str, start: int) -> int | None:
     """Return the first row id behind a damaged page at which reading can go on; None: there is none."""
     def readable(rowid: int) -> bool:
-        """Whether nothing is damaged at the first row from this one on."""
+        """Return whether the first row from `rowid` on is undamaged."""
         try:
             connection.execute(query, (rowid,)).fetchone()
         except sqlite3.OperationalError:
@@ -166,5 +166,5 @@ def _after(connection: sqlite3.Connection, query: str, start: int) -> int | None
         step *= 2
         if start + step >= 2**62:
             return None
-    first = start + step // 2 + 1  # the last one that was tried is damaged
+    first = start + step // 2 + 1  # the last row that was tried is damaged
     return first + bisect_left(range(first, start + step), True, key=readable)

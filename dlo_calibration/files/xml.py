@@ -9,8 +9,8 @@ processing instructions, namespaces (they could name a schema elsewhere), and mo
 bytes, depth or elements than a valid document needs, before it uses any content.
 It loads no other file.  Comments are allowed, and dropped.
 
-The schemas check elements, attributes and types.  What they cannot express, such as a physical value that
-contradicts its value, is checked by the modules of the documents; libraries for JSON do not apply to XML.
+The schemas check elements, attributes and types.  The modules of the documents check what schemas cannot
+express, such as a physical value that contradicts its value.
 
 The written form has the attributes in the order of the schema, two blanks per
 level, and each number as the shortest text that reads back as the same number.
@@ -29,19 +29,13 @@ from lxml import etree
 import numpy as np
 
 from dlo_calibration import reading
-from dlo_calibration.calibration.options import (
-    Declaration,
-    file_options,
-    FileOptions,
-    Options,
-    recordable,
-)
+from dlo_calibration.calibration.options import file_options, FileOptions, Options, recordable
 from dlo_calibration.errors import InputError, suggestion
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.parameters import exact
 
 SCHEMAS = Path(__file__).parent / 'schema'
-MAXIMUM_SIZE = 32 * 2**20  # bytes; far above any real request, and small enough for the memory
+MAXIMUM_SIZE = 32 * 2**20  # bytes; more than any real request needs, and small enough for the memory
 MAXIMUM_ELEMENTS = 500_000  # likewise
 MAXIMUM_DEPTH = 16  # the schemas need less than half
 MAXIMUM_ATTRIBUTES = 100  # of an element; the schemas need a fifth
@@ -73,15 +67,15 @@ def parse(octets: bytes, where: str, schema: str) -> Any:
     safe = {'encoding': 'utf-8', 'resolve_entities': False, 'no_network': True, 'load_dtd': False,
             'dtd_validation': False, 'attribute_defaults': False, 'huge_tree': False, 'remove_comments': True}
     parser = etree.XMLPullParser(events=('start', 'end', 'pi'), **safe)
-    # For each error, lxml counts the elements before it, which takes hours where many are wrong.  So reading
-    # ends with the piece of the first error, which this second parser without a tree finds.
+    # lxml counts the elements before each error, which takes hours for many errors.  So this second parser,
+    # without a tree, finds the first error, and reading ends with its piece.
     early = etree.XMLParser(target=_NoTree(), schema=checker, **safe)
     guard = _Guard(where)
     try:
         for begin in range(0, len(octets), PIECE):  # the guard sees a piece before the next one is parsed
             parser.feed(octets[begin:begin + PIECE])
             guard.check(parser.read_events())
-            with suppress(etree.XMLSyntaxError):  # the other parser raises it, too
+            with suppress(etree.XMLSyntaxError):  # the first parser raises it, too
                 early.feed(octets[begin:begin + PIECE])
             if early.feed_error_log:
                 break
@@ -161,13 +155,13 @@ def number(where: str, element: Any, name: str) -> float:
 
 
 def attributes(where: str, element: Any, record: Any) -> dict[str, Any]:
-    """Return the attributes of an element that are fields of a dataclass, each as the type of its field."""
+    """Return an element's attributes that are fields of a dataclass, each in the type of its field."""
     return {field.name: _value(where, element, field.name, str(field.type)) for field in fields(record)
             if field.name in element.attrib}
 
 
 def _value(where: str, element: Any, name: str, kind: str) -> Any:
-    """Return an attribute in `kind`, the type of its field in a dataclass."""
+    """Return an attribute as a `kind`, the type of its field in a dataclass."""
     text = element.get(name)
     if kind == 'str':
         return text
@@ -229,37 +223,25 @@ def add_options(parent: Any, tag: str, flat: Mapping[str, Any]) -> None:
 
 def read_options(where: str, element: Any, folder: Path | None) -> FileOptions:
     """
-    Return the options of a document that a file may set, each checked by its declaration.
+    Return the options of a document, checked by their declarations, without those that no file may set.
 
-    :param folder: of the document; None: it is not a file.
+    :param folder: of the document; None if it is no file.
     """
-    known = {declaration.name: declaration for declaration in Options.declarations()}
+    declarations = {declaration.name: declaration for declaration in Options.declarations()}
     given: dict[str, Any] = {}
     for option in element:
         name, text = option.get('name'), option.get('value')
         if name in given:
             raise refused(where, option, f'the name {name!r} twice', 'each name once')
         with located(where, option):
-            given[name] = _option(known[name], text) if name in known else None
+            given[name] = declarations[name].read(text) if name in declarations else None
             Options.of({name: given[name]})
     return file_options({name: list(value) if isinstance(value, tuple) else value
                          for name, value in given.items()}, folder)
 
 
-def _option(declaration: Declaration, text: str) -> Any:
-    kind = type(declaration.default)
-    try:
-        if kind is bool:
-            return {'true': True, 'false': False}[text]
-        if kind is tuple:
-            return tuple(text.split())
-        return kind(text)
-    except (KeyError, ValueError):
-        return declaration.checked(text)  # its error names the expected type
-
-
 class _NoTree:
-    """A parser's target that keeps nothing."""
+    """A parser's target that builds no tree."""
 
     def close(self) -> None:
         """Return nothing."""
@@ -352,10 +334,10 @@ def _remedy(tag: str, attribute: str | None, text: str, expected: str) -> str:
     if value:
         return suggestion(value[1], permitted, 'correct the file')
     kind, name = ('attribute', attribute) if attribute else ('element', tag)
-    known = _names(kind)
-    if name in known or attribute and 'not allowed' not in text:  # it is not misspelt, but in a wrong place
+    names = _names(kind)
+    if name in names or attribute and 'not allowed' not in text:  # misplaced, not misspelt
         return 'correct the file'
-    return suggestion(name, known if attribute else permitted, 'correct the file')
+    return suggestion(name, names if attribute else permitted, 'correct the file')
 
 
 def _names(kind: str) -> set[str]:

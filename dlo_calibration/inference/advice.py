@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_calibration.errors import InputError, SimulationError
+from dlo_calibration.evaluation.evaluation import with_hands
 from dlo_calibration.evaluation.linearisation import (
     Differences,
     information,
@@ -37,8 +38,8 @@ from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.observation.excitation import excites
 
-MOST_SOUGHT = 6  # parameters for which an action is sought, so that many do not take long
-WORTH_IT = 0.8  # an action is advised if it reduces the standard deviation to less than this share
+MOST_SOUGHT = 6  # largest number of parameters for which an action is sought, to save time
+WORTH_IT = 0.8  # an advised action reduces the standard deviation to less than this share
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +91,7 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, pool: Pool, point: Fl
     """
     if uncertainty.covariance is None:
         return None
-    possible, known = list(candidates(trials)), np.linalg.inv(uncertainty.covariance)
+    possible, present = list(candidates(trials)), np.linalg.inv(uncertainty.covariance)
 
     def derivatives(actions: Sequence[Candidate], varied: NDArray[np.bool_]
                     ) -> list[Floats | SimulationError]:
@@ -105,14 +106,14 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, pool: Pool, point: Fl
         alone = np.arange(space.dimension) == k
         promising: list[tuple[float, Candidate, Floats]] = []
         showing = [candidate for candidate in possible
-                   if excites([candidate.trial], space, np.inf)[0, k]]  # a table may be anywhere
+                   if excites([candidate.trial], space, np.inf)[0, k]]  # inf: a table may have any height
         if showing:
             sought.add(k)
         for candidate, column in zip(showing, derivatives(showing, alone), strict=True):
             if isinstance(column, SimulationError):  # this DLO does not allow the action
                 possible.remove(candidate)
                 continue
-            # The other parameters count as known: no more is possible.
+            # An upper bound of the gain: the other parameters count as known.
             at_best = float((now**-2 + information(column, uncertainty.scale)[k, k])**-0.5)
             if at_best < WORTH_IT * now:
                 promising.append((at_best, candidate, column))
@@ -121,7 +122,7 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, pool: Pool, point: Fl
         others = derivatives([candidate for _, candidate, _ in promising], ~alone)
         for (_, candidate, column), rest in zip(promising, others, strict=True):
             if not isinstance(rest, SimulationError):
-                std = float(standard_deviations(known + information(column + rest, uncertainty.scale))[k])
+                std = float(standard_deviations(present + information(column + rest, uncertainty.scale))[k])
                 if std < WORTH_IT * now and (best is None or std < best[0]):
                     best = std, candidate
         if best is not None:
@@ -133,8 +134,8 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, pool: Pool, point: Fl
 
 
 def sensitivities(trials: Sequence[Trial], space: ParameterSpace, pool: Pool, point: Floats, std: Floats,
-                  length: float, *, shown: NDArray[np.bool_], at_rest: bool = True
-                  ) -> list[Floats | SimulationError]:
+                  length: float, *, shown: NDArray[np.bool_], at_rest: bool = True,
+                  recorded: bool = False) -> list[Floats | SimulationError]:
     """
     Return the (m, d) derivatives of the simulated chains of each trial [m per unit cube].
 
@@ -146,13 +147,18 @@ def sensitivities(trials: Sequence[Trial], space: ParameterSpace, pool: Pool, po
     :param shown: (trials, d) False for parameters that a trial cannot show: their columns are zero without a
         rollout.
     :param at_rest: whether to refuse a rollout that does not come to rest; if not, its last state counts.
+    :param recorded: whether the hands of the trials have the errors of their parameters; those of planned
+        trials have none.
     :return: for a trial without derivatives the reason: a rollout diverges, or does not come to rest.
     :raises CancelledError: when stopped.
     """
     steps = np.clip(std, STEP, WIDEST)
     sides = [Differences.central(point, np.flatnonzero(row), steps) for row in shown]
-    jobs = [(trial, space.physical(space.values(beside), length))
-            for trial, differences in zip(trials, sides, strict=True) for beside in differences.points]
+    jobs = []
+    for trial, differences in zip(trials, sides, strict=True):
+        for beside in differences.points:
+            physical = space.physical(space.values(beside), length)
+            jobs.append((with_hands(trial, physical) if recorded else trial, physical))
     rollouts = iter(pool.simulate(jobs))
     derivatives: list[Floats | SimulationError] = []
     for trial, differences in zip(trials, sides, strict=True):
@@ -198,11 +204,11 @@ def candidates(trials: Sequence[Trial]) -> Iterator[Candidate]:
         return  # the ends touch each other, so that no direction is defined
     yield from _candidate(f'grip both ends and push them {100 * gap / 3:.0f} cm together', chain,
                           TwoHands(fractions=(0.0, 1.0), motion='together', distance=gap / 3))
-    apart = 1.03 * length - gap
-    if apart > 0:
+    stretch = 1.03 * length - gap
+    if stretch > 0:
         yield from _candidate(
-            f'grip both ends and pull them {100 * apart:.0f} cm apart, 3 % beyond the straight DLO', chain,
-            TwoHands(fractions=(0.0, 1.0), motion='apart', distance=apart))
+            f'grip both ends and pull them {100 * stretch:.0f} cm apart, 3 % beyond the straight DLO', chain,
+            TwoHands(fractions=(0.0, 1.0), motion='apart', distance=stretch))
 
 
 def _beyond(chain: Chain, fraction: float, across: Floats) -> tuple[float, ...]:

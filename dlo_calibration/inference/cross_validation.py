@@ -17,8 +17,8 @@ from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.score import distances
 
 MOST_FOLDS = 8
-CHANCE = 0.015  # that a test takes errors for smaller though they are not
-LEAST_GAIN = 0.02  # of the logarithm of the error
+CHANCE = 0.015  # false positive rate of each test
+LEAST_GAIN = 0.02  # mean reduction of the logarithm of the error
 
 #: Takes (k, d) points of the unit cube, returns their residuals (m,) [m], None for a failure.
 Evaluate = Callable[[Floats], Sequence[Floats | None]]
@@ -30,7 +30,7 @@ def left_out_errors(model: Linearisation, layout: ResidualLayout, residuals_at: 
 
     Each fold is predicted after a Gauss-Newton step towards the optimum of the others.  The step has a prior:
     without it, combinations of parameters that the trials hardly determine would move far.  It is halved,
-    twice at most, until the others really fit better; if they never do, the errors are those of the fit.
+    twice at most, until the others fit better; if they never do, the errors are those of the fit.
 
     :param model: of the residuals at the optimum of all trials.
     """

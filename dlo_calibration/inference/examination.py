@@ -36,10 +36,12 @@ from dlo_calibration.model.score import PointErrors
 DISTANCE_TOLERANCE = 0.5e-3
 
 #: Returns the residuals (m,) [m] of points that are being evaluated, None for a failure.
-Ended = Callable[[], Sequence[Floats | None]]
+Pending = Callable[[], Sequence[Floats | None]]
 
 #: Standard deviation (unit cube) above which a small step is not enough: contact and friction have kinks.
 SUSPECT = 0.01
+#: A step of so many standard deviations shows what happens there, if it is not shorter than SHORTEST.
+NEARBY, SHORTEST = 4.0, 0.003
 
 
 @dataclass(frozen=True)
@@ -72,8 +74,9 @@ class Examination:
 
 
 def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: Evaluate, *,
-            default: Floats, noise: float, finer: Ended | None = None,
-            starts: Sequence[Ended] = (), fading: NDArray[np.bool_] | None = None) -> Examination:
+            default: Floats, noise: float, finer: Pending | None = None,
+            starts: Sequence[Pending] = (), hands: Sequence[Pending] = (),
+            fading: NDArray[np.bool_] | None = None) -> Examination:
     """
     Examine the (d,) `point` of the unit cube, where the residuals are `residuals` (m,) [m].
 
@@ -82,6 +85,7 @@ def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: 
     :param noise: noise level, see `Examination` [m].
     :param finer: returns the residuals at `point` with more nodes and a smaller step; None: not simulated.
     :param starts: each returns those with initial chains of other noise; may be empty.
+    :param hands: each returns those with an error of the hands that is larger by its standard deviation.
     :param fading: (d,) False for parameters whose effect is much the same along their scale; None: all may
         fade or have kinks.
     """
@@ -103,8 +107,11 @@ def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: 
         shift = np.ones(len(point)) if fine is None else optimum_shift(fit, fine)
     drawn = [residuals for start in starts for residuals in start()]
     count += len(drawn)
+    others = [residuals for hand in hands for residuals in hand()]
+    count += len(others)
     uncertainty = at_minimum(fit, layout, noise=noise, shift=shift,
-                             starts=[residuals for residuals in drawn if residuals is not None])
+                             starts=[residuals for residuals in drawn if residuals is not None],
+                             hands=[residuals for residuals in others if residuals is not None])
     uncertainty = extended(fit, uncertainty, residuals_at, fading)
     return Examination(
         uncertainty=uncertainty, jacobian=frozen_array(fit.jacobian), noise=noise,
@@ -116,7 +123,7 @@ def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: 
 
 def _linearised(point: Floats, residuals: Floats, layout: ResidualLayout, residuals_at: Evaluate,
                 noise: float, fading: NDArray[np.bool_]) -> Linearisation:
-    """Return the linear model of the residuals; uncertain parameters take wide steps."""
+    """Return the linear model of the residuals; uncertain parameters take wide steps, certain ones short."""
     dimension = len(point)
 
     def measured(columns: Sequence[int], steps: Floats) -> Floats:
@@ -131,16 +138,17 @@ def _linearised(point: Floats, residuals: Floats, layout: ResidualLayout, residu
     jacobian = measured(range(dimension), steps)
     for _ in range(2):
         std = at_minimum(Linearisation(point, residuals, jacobian), layout, noise=noise).std
-        wider = np.where(std > SUSPECT, np.clip(std, 0.1, WIDEST), steps)
-        weak = np.flatnonzero(fading & (wider > 1.5 * steps)).tolist()
-        if not weak:
+        wanted = np.where(std > SUSPECT, np.clip(std, 0.1, WIDEST), np.clip(NEARBY * std, SHORTEST, STEP))
+        other = (fading & (wanted > 1.5 * steps)) | (1.5 * wanted < steps)
+        columns = np.flatnonzero(other).tolist()
+        if not columns:
             break
-        steps[weak] = wider[weak]
-        wide = measured(weak, steps)
-        for k in weak:
-            # A small step may see a kink and no slope, so that the smaller effect counts.
-            if np.linalg.norm(wide[:, k]) < np.linalg.norm(jacobian[:, k]):
-                jacobian[:, k] = wide[:, k]
+        steps[columns] = wanted[columns]
+        again = measured(columns, steps)
+        for k in columns:
+            # A short step may see a kink, a long one a slope that is not here: the smaller effect counts.
+            if np.linalg.norm(again[:, k]) < np.linalg.norm(jacobian[:, k]):
+                jacobian[:, k] = again[:, k]
     return Linearisation(point, residuals, jacobian)
 
 
@@ -164,7 +172,7 @@ def extended(fit: Linearisation, uncertainty: Uncertainty, residuals_at: Evaluat
         there = np.tile(point, (len(unsure), 1))
         for row, (side, k) in zip(there, unsure, strict=True):
             row[k] = ends[side, k]
-        still = []
+        moved = []
         for (side, k), residuals in zip(unsure, residuals_at(there), strict=True):
             if residuals is None:
                 continue
@@ -172,8 +180,8 @@ def extended(fit: Linearisation, uncertainty: Uncertainty, residuals_at: Evaluat
             if abs(float(own @ (residuals - fit.residuals))) < needed[k]:
                 ends[side, k] = np.clip(2 * ends[side, k] - point[k], *limits)
                 if ends[side, k] != limits[side]:
-                    still.append((side, k))
-        unsure = still
+                    moved.append((side, k))
+        unsure = moved
     for side, k in unsure:
         ends[side, k] = limits[side]
     return uncertainty.within(ends[0], ends[1])
@@ -191,7 +199,7 @@ def _converged(fit: Linearisation, uncertainty: Uncertainty) -> bool:
 @dataclass(frozen=True)
 class Confirmation:
     """
-    What a second engine gives for the found parameters.
+    The outcome of the best parameters in a second engine.
 
     :param engine: the second engine's name.
     :param score: its average difference score over the trials [cm].

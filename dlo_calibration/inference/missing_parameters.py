@@ -16,6 +16,7 @@ from dlo_calibration.evaluation.residuals import Huber
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import (
     BY_NAME,
+    HANDS,
     Parameter,
     PARAMETERS,
     ParameterSpace,
@@ -48,9 +49,8 @@ def missing_parameters(space: ParameterSpace, evaluate: Callable[[ParameterSpace
     """
     Return the parameters that would explain at least a tenth of the squared residuals, largest share first.
 
-    Each parameter that was held fixed is changed once.  Of its effect, only the part counts that the free
-    parameters cannot imitate (a score test: Rao, Linear Statistical Inference and Its Applications, 1973,
-    6e.3).
+    Each parameter that was held fixed is changed once.  Only the part of its effect that the free parameters
+    cannot imitate counts (a score test: Rao, Linear Statistical Inference and Its Applications, 1973, 6e.3).
 
     :param space: of the calibration.
     :param evaluate: returns an evaluator for another space, which compares the goals that `fit` does.
@@ -60,24 +60,24 @@ def missing_parameters(space: ParameterSpace, evaluate: Callable[[ParameterSpace
     """
     roots = Huber.of(fit.residuals).roots(fit.residuals)
     weighted = fit.weighted(roots)
-    left = perpendicular(weighted.jacobian, weighted.residuals)
-    begun = [(name, evaluate(wider).begin(np.hstack([np.tile(fit.point, (len(moves), 1)), moves])))
+    unexplained = perpendicular(weighted.jacobian, weighted.residuals)
+    pending = [(name, evaluate(wider).begin(np.hstack([np.tile(fit.point, (len(moves), 1)), moves])))
              for name, wider, moves in _candidates(space, parts)]
     missing = []
-    for name, ended in begun:
+    for name, ended in pending:
         columns = [perpendicular(weighted.jacobian, roots * (residuals - fit.residuals))
                    for residuals in ended() if residuals is not None]
-        share = _explained(left, columns, BY_NAME[name] if name != PARTS else None)
+        share = _explained(unexplained, columns, BY_NAME[name] if name != PARTS else None)
         if share >= 0.1:
             missing.append(MissingParameter(name, share))
     return tuple(sorted(missing, key=lambda parameter: -parameter.share))
 
 
 def _candidates(space: ParameterSpace, parts: bool = True) -> Iterator[tuple[str, ParameterSpace, Floats]]:
-    """Yield each name, the space with its a parameters added, and (k, a) values to try in the unit cube."""
+    """Yield names, spaces with a more free parameters, and (k, a) values of these in the unit cube to try."""
     for parameter in PARAMETERS:
         name = parameter.name
-        if name in space.free or name in (*PART_NAMES, *REST_SHAPE) or _is_idle(name, space):
+        if name in space.free or name in (*PART_NAMES, *REST_SHAPE, *HANDS) or _is_idle(name, space):
             continue
         fixed = {key: value for key, value in space.fixed.items() if key != name}
         now = space.fixed.get(name, parameter.default) / SCALE
@@ -98,15 +98,15 @@ def _is_idle(name: str, space: ParameterSpace) -> bool:
     return name == 'mass' and not space.mass_known or name == 'natural_curvature' and space.knots > 0
 
 
-def _explained(left: Floats, columns: Sequence[Floats], parameter: Parameter | None) -> float:
+def _explained(unexplained: Floats, columns: Sequence[Floats], parameter: Parameter | None) -> float:
     """Return the share of the squares of `left` (m,) that a bounded combination of (m,) columns explains."""
-    matrix = np.stack(columns, axis=1) if columns else np.zeros((len(left), 0))
-    total = float(left @ left)
+    matrix = np.stack(columns, axis=1) if columns else np.zeros((len(unexplained), 0))
+    total = float(unexplained @ unexplained)
     if not total > 0 or not float(np.square(matrix).sum()) > 0:
         return 0.0
     # An effect that is absent at its default cannot be negative.
     least = 0.0 if parameter is not None and parameter.neutral == 0 else -FURTHEST
     bounds = np.full(len(columns), least), np.full(len(columns), FURTHEST)
-    steps = bounded_least_squares(matrix, -left, *bounds)
-    rest = left + matrix @ steps
+    steps = bounded_least_squares(matrix, -unexplained, *bounds)
+    rest = unexplained + matrix @ steps
     return 1 - float(rest @ rest) / total

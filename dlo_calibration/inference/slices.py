@@ -23,7 +23,7 @@ from dlo_calibration.model.parameters import PAPER_PARAMETERS, SCALE
 LEVELS = (4, 8, 16)  # intervals of a line, coarse first: each level uses the points of the one before
 NARROWEST = 10.0  # a slice extends at least this far to each side (0..100)
 MOST_SECONDS = 6.0  # for all slices, which the page waits for
-MOST_LINES = 6  # more parameters would take too long to simulate, and to look at
+MOST_LINES = 6  # more would take too long to simulate, and to read
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Slices:
     """
     Lines through the found values, and planes for the most correlated pairs of parameters.
 
-    :param lines: for each parameter, or `chosen` ones of many.
+    :param lines: one for each of the `varied_parameters`.
     :param evaluations: number of parameter sets that were simulated.
     :param complete: False if the time was too short, so that some slices are coarse or missing.
     """
@@ -88,13 +88,13 @@ def simulate_slices(evaluator: Evaluator, best: Evaluation, std: Floats, examina
     :param examination: of the found values; None if there was none.
     :param executor: its workers simulate, as in `Pool`.
     :param seconds: time limit [s].
-    :param should_stop: asked often; once True, the slices so far are returned.
+    :param should_stop: polled; once it returns True, the slices so far are returned.
     :param clock: the time [s].
     """
     end = clock() + seconds
     pool = Pool(evaluator.simulator, executor, lambda: should_stop() or clock() > end)
     grid = _Grid(BatchEvaluator(evaluator, pool), best, std)
-    dimension, varied = evaluator.space.dimension, chosen(evaluator.space.free, std)
+    dimension, varied = evaluator.space.dimension, varied_parameters(evaluator.space.free, std)
     lines: tuple[Line, ...] = ()
     planes: tuple[Plane, ...] = ()
     try:
@@ -109,7 +109,7 @@ def simulate_slices(evaluator: Evaluator, best: Evaluation, std: Floats, examina
     return Slices(lines, planes, grid.count, True)
 
 
-def chosen(names: Sequence[str], std: Floats) -> list[int]:
+def varied_parameters(names: Sequence[str], std: Floats) -> list[int]:
     """Return the indices of the paper's parameters and of the least certain others, `MOST_LINES` at most."""
     others = [k for k in np.argsort(-std, kind='stable').tolist() if names[k] not in PAPER_PARAMETERS]
     first = [k for k, name in enumerate(names) if name in PAPER_PARAMETERS]
@@ -145,12 +145,12 @@ class _Grid:
         return len(self._evaluations)
 
     def simulate(self, varied: Sequence[int], drawn: Sequence[tuple[int, int]], level: int) -> None:
-        """Simulate what lines and planes need, lines first, until the time is up."""
+        """Simulate the points of lines and planes, lines first, until the time is up."""
         changed = [{k: float(value)} for k in varied for value in self._values(k, level)]
         changed += [dict(zip(pair, map(float, values), strict=True)) for pair in drawn
                     for values in product(*(self._values(k, level) for k in pair))]
-        known = {tuple(self._best.point.tolist()), *self._evaluations}
-        new = [point for point in dict.fromkeys(map(self._key, changed)) if point not in known]
+        evaluated = {tuple(self._best.point.tolist()), *self._evaluations}
+        new = [point for point in dict.fromkeys(map(self._key, changed)) if point not in evaluated]
         if new:
             for point, evaluation in zip(new, self._evaluate(np.array(new), 0), strict=False):
                 self._evaluations[point] = evaluation

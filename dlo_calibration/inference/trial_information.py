@@ -19,6 +19,7 @@ import zlib
 import numpy as np
 
 from dlo_calibration.errors import SimulationError
+from dlo_calibration.evaluation.evaluation import with_hands
 from dlo_calibration.evaluation.linearisation import (
     information,
     Linearisation,
@@ -30,6 +31,7 @@ from dlo_calibration.evaluation.pool import Pool
 from dlo_calibration.evaluation.residuals import Huber, ResidualLayout
 from dlo_calibration.inference.advice import sensitivities
 from dlo_calibration.inference.examination import Examination, extended
+from dlo_calibration.inference.outlier import candidate, is_outlier
 from dlo_calibration.inference.uncertainty import (
     at_minimum,
     IDENTIFIABLE,
@@ -41,17 +43,24 @@ from dlo_calibration.inference.uncertainty import (
     WEAK,
 )
 from dlo_calibration.model.chain import Floats, frozen_array
-from dlo_calibration.model.parameters import knot_names, KNOTS, ParameterSpace, REST_SHAPE, SCALE
-from dlo_calibration.model.score import residuals, seen_points
+from dlo_calibration.model.parameters import (
+    knot_names,
+    KNOTS,
+    measured,
+    ParameterSpace,
+    REST_SHAPE,
+    SCALE,
+)
+from dlo_calibration.model.score import distances, residuals, seen_points
 from dlo_calibration.model.trial import Goal, shown_goals, Trial
 from dlo_calibration.observation.excitation import excites
 from dlo_calibration.observation.noise import NO_NOISE, with_other_noise
 
 ROUNDS = 8  # Gauss-Newton steps to the best values, at most
 WORTH_A_STEP = 0.02  # share of the cost that a step must promise to save
-WORTH_A_MOVE = 0.1  # share of the cost that a value must save to which no derivative points
-TRIED_VALUES = (0.15, 0.4, 0.65, 0.9)  # values of a parameter of which nothing is known
-STARTS = 4  # simulations of each trial from initial chains with other noise
+WORTH_A_MOVE = 0.1  # share of the cost that one of the TRIED_VALUES must save
+TRIED_VALUES = (0.15, 0.4, 0.65, 0.9)  # of a parameter whose derivative may not point to its value
+STARTS = 8  # simulations of each trial from initial chains with other noise
 #: A trial is informative if it reduces a standard deviation below this share; repeating one leaves 0.71.
 NEW = 0.6
 
@@ -66,7 +75,8 @@ class TrialInformation:
     :param before: (d,) standard deviations without the trial, in the unit cube.
     :param after: (d,) standard deviations with the trial.
     :param verdicts: on each parameter, with the trial.
-    :param problem: why they are unknown (nan); empty if they are known.
+    :param failure: why they are unknown (nan); empty if they are known.
+    :param outlier: which of the trials so far does not fit the others, in words; empty: all do.
     """
 
     trial: str
@@ -74,17 +84,18 @@ class TrialInformation:
     before: Floats
     after: Floats
     verdicts: tuple[str, ...] = ()
-    problem: str = ''
+    failure: str = ''
+    outlier: str = ''
 
     def __post_init__(self) -> None:
         for name in ('before', 'after'):
             object.__setattr__(self, name, frozen_array(getattr(self, name)))
 
     @classmethod
-    def unknown(cls, trial: str, names: tuple[str, ...], problem: str) -> TrialInformation:
+    def unknown(cls, trial: str, names: tuple[str, ...], failure: str) -> TrialInformation:
         """Return the information of a trial that could not be simulated: unknown."""
         nothing = np.full(len(names), np.nan)
-        return cls(trial, names, nothing, nothing, problem=problem)
+        return cls(trial, names, nothing, nothing, failure=failure)
 
     @property
     def improved(self) -> tuple[str, ...]:
@@ -95,9 +106,11 @@ class TrialInformation:
     @property
     def words(self) -> str:
         """One sentence for the user."""
-        if self.problem:
-            return f'the information of {self.trial} is unknown: {self.problem}'
+        if self.failure:
+            return f'the information of {self.trial} is unknown: {self.failure}'
         improved = self.improved
+        if self.outlier:
+            return self.outlier
         if not improved:
             return f'{self.trial} adds nothing new: repeat it only to average noise{self._so_far}'
         knots = [name for name in self.names if name in knot_names(KNOTS[-1])]
@@ -116,7 +129,7 @@ class TrialInformation:
 
     @property
     def _so_far(self) -> str:
-        """The verdicts in words; those on knots of a rest shape are left out."""
+        """The verdicts in words, without those on knots of a rest shape."""
         words = []
         for verdict in (IDENTIFIABLE, WEAK, NOT_IDENTIFIABLE):
             names = [name for name, own in zip(self.names, self.verdicts, strict=False) if own == verdict
@@ -127,7 +140,7 @@ class TrialInformation:
     @property
     def values(self) -> dict[str, Any]:
         """Standard deviations (0..100) and verdicts, under the keys of a status; empty if unknown."""
-        if self.problem:
+        if self.failure:
             return {}
         return {f'{key}_{name}': float(std) * SCALE for key, column in (
             ('std_before', self.before), ('std_after', self.after))
@@ -180,7 +193,7 @@ class TrialModel:
 @dataclass(frozen=True, eq=False)
 class Appraisal:
     """
-    What some trials make known before any calibration.
+    The information of some trials before any calibration.
 
     :param names: of the d parameters.
     :param point: (d,) their best values.
@@ -193,21 +206,32 @@ class Appraisal:
     uncertainty: Uncertainty
     models: tuple[TrialModel, ...] = ()
 
+    def outlier(self, trials: Sequence[Trial]) -> str:
+        """Say which of the appraised trials does not fit the others; '' if all do."""
+        errors = np.array([distances(model.fit.predicted(self.point - model.fit.point)).mean()
+                           for model in self.models])
+        k = candidate(errors)
+        if k is None or not is_outlier(k, errors):
+            return ''
+        usual = float(np.delete(errors, k).mean())
+        return (f'{trials[k].name} does not fit the others: {measured(float(errors[k]), "m")} from what they '
+                f'predict, where they miss {measured(usual, "m")}; a hand may have slipped or let go early: '
+                'repeat it')
+
     @classmethod
     def before(cls, names: tuple[str, ...], point: Floats) -> Appraisal:
-        """Return what is known before any simulation, with a (d,) point to begin at."""
-        known = np.ones(len(names))
+        """Return the appraisal before any simulation, at a (d,) point to begin from."""
+        ones = np.ones(len(names))
         return cls(names, point, Uncertainty(
-            UNKNOWN_STD * known, 0 * known, known, known == 0, known == 0,
-            UNKNOWN_STD**2 * np.eye(len(names))))
+            UNKNOWN_STD * ones, 0 * ones, ones, ones == 0, ones == 0, UNKNOWN_STD**2 * np.eye(len(names))))
 
 
 def without_repeated_goals(trial: Trial) -> Trial:
     """
     Return a trial without the goals that add little.
 
-    Of several goals of the same DLO at rest, the first stays; of those in motion, a few stay, evenly spread.
-    The outcome does not change while a tracker continues to show a DLO at rest.
+    Among goals at the same rest, the first stays; among goals in motion, a few stay, evenly spread.  So a
+    tracker that continues to show a DLO at rest changes nothing.
     """
     goals: list[Goal] = []
     moving = [goal for goal in trial.goals if not goal.stable]
@@ -278,7 +302,7 @@ class Appraiser:
     def _minimum(self, trials: Sequence[Trial], models: Sequence[TrialModel | None], point: Floats,
                  std: Floats) -> _Minimum:
         """
-        Return where Gauss-Newton steps from a (d,) point end.
+        Return the minimum that Gauss-Newton steps from a (d,) point reach.
 
         Unlike a search, it simulates a trial only where its model among `models` does not hold, and halves
         steps that lead too far.
@@ -295,7 +319,7 @@ class Appraiser:
                 point = (point + best.point) / 2
                 continue
             models = now
-            fit, layout = _whole(now, trials, point)
+            fit, layout = _joint_model(now, trials, point)
             loss = Huber.of(fit.residuals)
             if best is not None:
                 same = min(loss, best.loss)
@@ -318,8 +342,8 @@ class Appraiser:
         """
         Return a (d,) point that fits clearly better than a minimum; None if there is none.
 
-        A parameter that the trials show may be so far from its default that no derivative there points to it,
-        such as the elasticity of a DLO that is much more elastic than a rope.
+        A parameter may be so far from its default that no derivative there points to it, such as the
+        elasticity of a DLO that is much more elastic than a rope.
         """
         shown = np.logical_or.reduce(excites(trials, self.space, self.table_height))
         start, cost = best.point, best.loss.cost(best.residuals)
@@ -334,7 +358,7 @@ class Appraiser:
 
     def _examined(self, names: tuple[str, ...], trials: Sequence[Trial], point: Floats,
                   models: tuple[TrialModel, ...]) -> Appraisal:
-        fit, layout = _whole(models, trials, point)
+        fit, layout = _joint_model(models, trials, point)
         shift = optimum_shift(fit, fit.residuals + np.concatenate([model.finer for model in models]))
         starts = fit.residuals + np.hstack([model.moved for model in models])
         uncertainty = at_minimum(fit, layout, noise=self.noise, shift=shift, starts=starts)
@@ -352,7 +376,7 @@ class Appraiser:
 
     def _simulated(self, trial: Trial, point: Floats, pool: Pool | None = None) -> Floats:
         physical = self.space.physical(self.space.values(point), self.length)
-        rollout, = (pool or self.pool).simulate([(trial, physical)])
+        rollout, = (pool or self.pool).simulate([(with_hands(trial, physical), physical)])
         if isinstance(rollout, SimulationError):
             raise rollout
         return residuals(trial, rollout.chains)
@@ -361,7 +385,7 @@ class Appraiser:
         """Simulate a trial around a (d,) point; a parameter that it certainly cannot show is not varied."""
         shown, here = excites([trial], self.space, self.table_height)[0], self._simulated(trial, point)
         jacobian, = sensitivities([trial], self.space, self.pool, point, std, self.length,
-                                  shown=shown[None], at_rest=False)
+                                  shown=shown[None], at_rest=False, recorded=True)
         if isinstance(jacobian, SimulationError):
             raise jacobian
         rows = np.repeat(seen_points(trial).ravel(), 3)
@@ -386,7 +410,7 @@ class Appraiser:
         return replace(model, moved=moved, finer=finer, complete=True)
 
 
-def _whole(models: Sequence[TrialModel], trials: Sequence[Trial], point: Floats
+def _joint_model(models: Sequence[TrialModel], trials: Sequence[Trial], point: Floats
            ) -> tuple[Linearisation, ResidualLayout]:
     """Return the linear model of all trials at a (d,) point, and the layout of its residuals."""
     fits = [model.fit for model in models]

@@ -10,8 +10,9 @@ into account:
 
 - the errors of neighbouring points are correlated, so that these count as fewer;
 - the initial chain of each trial is measured with noise, too, and so are length and shape of the DLO;
-- if the model cannot explain the residuals, the trials disagree with each other; the jackknife and
-  the bootstrap over the trials measure how much, and the larger of both counts;
+- if noise cannot explain the residuals, the trials may disagree with each other; the jackknife and
+  the bootstrap over the trials measure how much, and the larger of both counts; an interval contains
+  what the trials say without any one of them;
 - the step and the nodes of the simulation move the optimum;
 - trials that look alike share the error of the model, so that repeating one averages only its noise;
 - the reported point may be beside the minimum, after a search that does not converge (`Uncertainty.at`).
@@ -38,8 +39,9 @@ UNKNOWN_STD = 1 / np.sqrt(12)  # of the uniform distribution on 0..1, which is t
 # the ends of the second by 7 and 4 %, which is most of the 10 and 6 % that a value from far away costs.
 IDENTIFIABLE_WIDTH, WEAK_WIDTH = 0.2, 0.4
 DEVIATIONS = 1.645  # half the width of a 90 % interval, in standard deviations of a normal distribution
+DISAGREEMENT = 1.05  # from this multiple of the noise level on, trials may disagree
 MODEL_ERROR = 1.6  # noise alone does not explain residuals that exceed the noise level by this factor
-LIKE = 0.8  # trials are alike from this cosine of their derivatives on; different actions stay below 0.5
+SIMILAR = 0.8  # least cosine between the derivatives of similar trials; different actions stay below 0.5
 INVOLVED = 0.3  # a parameter belongs to a combination if its share of the unit vector is at least this
 
 IDENTIFIABLE, WEAK, NOT_IDENTIFIABLE = 'identifiable', 'weak', 'not identifiable'
@@ -86,7 +88,7 @@ class Uncertainty:
         return tuple(map(verdict, self.lower.tolist(), self.upper.tolist()))
 
     def of_excited(self, excited: NDArray[np.bool_]) -> Uncertainty:
-        """Return the uncertainty in which parameters that are not excited, (d,) False, are unknown."""
+        """Return the uncertainty with unknown parameters where `excited`, (d,), is False."""
         return replace(
             self, excited=excited, std=frozen_array(np.where(excited, self.std, UNKNOWN_STD)),
             lower=frozen_array(np.where(excited, self.lower, 0.0)),
@@ -108,9 +110,9 @@ class Uncertainty:
         A standard deviation becomes the root mean square distance of the parameter from that point.  An
         interval that reaches an end of the scale still does.
 
-        :param point: (d,) that this is the uncertainty at.
+        :param point: (d,) where this uncertainty holds.
         :param there: (d,) the other point.
-        :param remaining: (d,) how far the minimum is from it.
+        :param remaining: (d,) the step from the other point to the minimum.
         """
         std = np.minimum(np.hypot(self.std, remaining), UNKNOWN_STD)
         wider, covariance = std / self.std, self.covariance
@@ -175,7 +177,7 @@ def spread_of_best(evaluations: Sequence[Evaluation], best: Floats) -> Uncertain
 
 
 def prior_information(dimension: int) -> Floats:
-    """Return the (d, d) information of the prior: d parameters may have any value of their scale."""
+    """Return the (d, d) information of the prior: a uniform distribution of d parameters on their scales."""
     return np.asarray(np.eye(dimension) / UNKNOWN_STD**2)
 
 
@@ -185,13 +187,15 @@ def noise_alone(residual: float, noise: float) -> bool:
 
 
 def at_minimum(fit: Linearisation, layout: ResidualLayout, *, noise: float = float('nan'),
-               shift: Floats | None = None, starts: Sequence[Floats] | Floats = ()) -> Uncertainty:
+               shift: Floats | None = None, starts: Sequence[Floats] | Floats = (),
+               hands: Sequence[Floats] = ()) -> Uncertainty:
     """
     Return the uncertainty that follows from the linearised residuals at a minimum.
 
     :param noise: noise level: standard deviation of one measured coordinate [m]; nan if unknown.
     :param shift: (d,) how far a finer simulation moves the optimum; None: unknown.
     :param starts: residuals (m,) [m] at the minimum, for initial chains with other noise; may be empty.
+    :param hands: those for errors of the hands that are larger by one standard deviation each.
     """
     point, loss = fit.point, Huber.of(fit.residuals)
     clipped = loss.clipped(fit.residuals)
@@ -199,27 +203,41 @@ def at_minimum(fit: Linearisation, layout: ResidualLayout, *, noise: float = flo
     scale = residual * float(np.sqrt(correlation_length(clipped, layout)))
     weighted = fit.weighted(loss.roots(fit.residuals) / scale)
     prior = prior_information(len(point))
-    groups = alike(weighted, layout)
+    groups = similar_trials(weighted, layout)
     shared = shared_error(clipped, layout, groups)
     information = shared_information(weighted, layout, shared)
     with np.errstate(divide='ignore'):
         excited = 1 / np.sqrt(np.diag(information)) < UNKNOWN_STD
     covariance = np.linalg.inv(information + prior)
-    extra = np.zeros(len(point))
-    if len(layout.shapes) >= 3 and not noise_alone(residual, noise):  # two say too little of a variance
+    extra, without = np.zeros(len(point)), np.zeros((1, len(point)))
+    # Three standard deviations of a residual that is estimated from so much white noise.
+    chance = 3 / np.sqrt(2 * max(1, len(fit.residuals) - len(point)))
+    if len(layout.shapes) >= 2 and not residual < (DISAGREEMENT + chance) * noise:
         parts: Sequence[Rows] = layout.rows if len(groups) < 3 else [
             np.concatenate([np.r_[layout.rows[k]] for k in group]) for group in groups]
-        disagreement = np.maximum(np.var(jackknife(weighted, parts, prior), axis=0) * (len(parts) - 1),
-                                  np.var(bootstrap(weighted, parts, prior), axis=0))
-        extra = np.maximum(disagreement - np.diag(covariance), 0.0)
+        without = jackknife(weighted, parts, prior)
+        if len(parts) >= 3:  # two say too little of a variance
+            disagreement = np.maximum(np.var(without, axis=0) * (len(parts) - 1),
+                                      np.var(bootstrap(weighted, parts, prior), axis=0))
+            extra = np.maximum(disagreement - np.diag(covariance), 0.0)
     if shift is not None:
         extra = extra + (2 * shift)**2  # twice as fine halves the error, which is of first order
     if len(starts):  # the noise of each trial's own initial chain moves the optimum by a Gauss-Newton step
-        moved = np.array([loss.clipped(residuals) - clipped for residuals in starts])
-        pulls = [moved[:, rows] @ fit.jacobian[rows] / scale**2 for rows in layout.rows]
+        changes = np.array(starts) - fit.residuals
+        # The residuals contain one such change: larger ones come from too high a noise level, or from chaos.
+        size = np.sqrt(np.mean(changes**2, axis=1, keepdims=True))
+        changes = changes * np.minimum(1.0, residual / np.maximum(size, TINY)) * loss.roots(fit.residuals)**2
+        bias = changes.mean(axis=0)  # that noise gives to all trials in the same direction
+        pulls = [(changes - bias)[:, rows] @ fit.jacobian[rows] / scale**2 for rows in layout.rows]
         step = np.linalg.inv(weighted.information + prior)
-        moves = step @ together(pulls, shared) @ step / len(starts)
+        moves = step @ weighted_products(pulls, shared) @ step / len(starts)
+        biased = step @ fit.jacobian.T @ bias / scale**2
+        moves = moves + np.outer(biased, biased)
         covariance = covariance + np.where(np.outer(excited, excited), moves, 0.0)
+    for residuals in hands:
+        pull = fit.jacobian.T @ (loss.roots(fit.residuals)**2 * (residuals - fit.residuals)) / scale**2
+        move = np.linalg.solve(weighted.information + prior, pull)
+        covariance = covariance + np.where(np.outer(excited, excited), np.outer(move, move), 0.0)
     covariance = covariance + np.diag(np.where(excited, extra, 0.0))
     # No standard deviation is larger than that of the prior.
     shrink = np.minimum(1.0, UNKNOWN_STD / np.sqrt(np.diag(covariance)))
@@ -227,8 +245,10 @@ def at_minimum(fit: Linearisation, layout: ResidualLayout, *, noise: float = flo
     std = np.where(excited, np.sqrt(np.diag(covariance)), UNKNOWN_STD)
     lower = np.where(excited, np.maximum(point - DEVIATIONS * std, 0.0), 0.0)
     upper = np.where(excited, np.minimum(point + DEVIATIONS * std, 1.0), 1.0)
-    return Uncertainty(frozen_array(std), frozen_array(lower), frozen_array(upper), excited,
-                       excited & at_end(point), frozen_array(covariance), residual, scale)
+    uncertainty = Uncertainty(frozen_array(std), frozen_array(lower), frozen_array(upper), excited,
+                              excited & at_end(point), frozen_array(covariance), residual, scale)
+    return uncertainty.within(np.clip(np.minimum(lower, point + without.min(axis=0)), 0.0, 1.0),
+                              np.clip(np.maximum(upper, point + without.max(axis=0)), 0.0, 1.0))
 
 
 def at_end(point: Floats) -> NDArray[np.bool_]:
@@ -236,16 +256,16 @@ def at_end(point: Floats) -> NDArray[np.bool_]:
     return np.asarray((point < 0.002) | (point > 0.998))
 
 
-def alike(fit: Linearisation, layout: ResidualLayout) -> list[list[int]]:
-    """Group the indices of T trials that show the same, because their derivatives are nearly parallel."""
+def similar_trials(fit: Linearisation, layout: ResidualLayout) -> list[list[int]]:
+    """Group the indices of T trials whose derivatives are nearly parallel: they show the same."""
     sides = [block.ravel() for block in layout.aligned(fit.jacobian)]
     sizes = [max(float(np.linalg.norm(side)), TINY) for side in sides]
     groups: list[list[int]] = []
     for k, side in enumerate(sides):
-        like = [group for group in groups if layout.shapes[group[0]] == layout.shapes[k]
-                and float(sides[group[0]] @ side) >= LIKE * sizes[group[0]] * sizes[k]]
-        if like:
-            like[0].append(k)
+        similar = [group for group in groups if layout.shapes[group[0]] == layout.shapes[k]
+                   and float(sides[group[0]] @ side) >= SIMILAR * sizes[group[0]] * sizes[k]]
+        if similar:
+            similar[0].append(k)
         else:
             groups.append([k])
     return groups
@@ -274,17 +294,17 @@ def shared_information(fit: Linearisation, layout: ResidualLayout, shared: Float
     Return the (d, d) information of T trials whose errors have the correlations `shared`, (T, T).
 
     It is H V^-1 H (Godambe's information: Varin, Reid and Firth, An Overview of Composite Likelihood Methods,
-    2011, 2.1) with the information H of independent trials and the variance V of the gradient: that of
-    H for independent ones, and that of one trial for its exact repeats.
+    2011, 2.1) with the information H of independent trials and the variance V of the gradient.  It is H for
+    independent trials, and the information of one trial for its exact repeats.
     """
     alone = fit.information
     if np.count_nonzero(shared) == len(shared):
         return alone
-    gradients = together(layout.aligned(fit.jacobian), shared)
+    gradients = weighted_products(layout.aligned(fit.jacobian), shared)
     return np.asarray(alone @ np.linalg.pinv(gradients, hermitian=True) @ alone)
 
 
-def together(blocks: Sequence[Floats], shared: Floats) -> Floats:
+def weighted_products(blocks: Sequence[Floats], shared: Floats) -> Floats:
     """Return (d, d): the products B_t^T B_s of T blocks (r, d), summed with the weights `shared`, (T, T)."""
     dimension = blocks[0].shape[1]
     return sum((shared[k, other] * blocks[k].T @ blocks[other]
@@ -343,10 +363,10 @@ def correlation_length(residuals: Floats, layout: ResidualLayout) -> float:
     lengths = []
     for axis in (1, 0):
         length, turned = 1.0, [np.moveaxis(block, axis, 0) for block in blocks]
-        known = [np.moveaxis(block, axis, 0) for block in seen]
+        masks = [np.moveaxis(block, axis, 0) for block in seen]
         for lag in range(1, max(len(block) for block in turned) // 2 + 1):
             pairs = [(block[lag:], block[:-lag]) for block in turned if lag <= len(block) // 2]
-            count = sum(int(np.sum(block[lag:] & block[:-lag])) for block in known if lag <= len(block) // 2)
+            count = sum(int(np.sum(block[lag:] & block[:-lag])) for block in masks if lag <= len(block) // 2)
             if not count:
                 break
             product = sum(float(np.vdot(later, earlier)) for later, earlier in pairs) / count

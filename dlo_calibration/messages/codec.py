@@ -117,16 +117,9 @@ class ActionMessage:
         if len(set(names)) < len(names) or '' in names:
             raise InputError(thing, f'joint_names {list(names)}', 'a different name for each hand',
                              'correct joint_names')
-        count = len(times)
-        if count == 0:
+        if not len(times):
             raise InputError(thing, 'no trajectory points', 'at least one',
                              'send where the hands closed, moved and opened')
-        if times.shape != (count,) or positions.shape != (count, len(names), 3) \
-                or orientations.shape != (count, len(names), 4):
-            raise InputError(
-                thing, f'times {times.shape}, positions {positions.shape}, orientations '
-                f'{orientations.shape}', '(k,), (k, h, 3) and (k, h, 4) for k waypoints of h hands',
-                'give every hand one pose per waypoint')
         check_waypoints(thing, 'trajectory point', names, {
             'time_from_start': times, 'translation': positions, 'rotation': orientations}, MINIMUM_STEP)
         if times[0] < 0 or times[-1] > MAXIMUM_DURATION:
@@ -146,6 +139,13 @@ class ActionMessage:
 
 
 Message = Union[ChainMessage, ActionMessage]
+
+
+def repeats(message: Message, other: Message) -> bool:
+    """Return whether two messages of one kind and stamp have the same content."""
+    here, there = (each.positions if isinstance(each, ActionMessage) else each.chain.observed
+                   for each in (message, other))
+    return bool(np.array_equal(here, there, equal_nan=True))
 
 
 def read(kind: str, message: Any) -> Message:
@@ -303,6 +303,12 @@ def bag_types() -> MessageTypes:
 
     return MessageTypes(get_typestore(Stores.ROS2_JAZZY).types.__getitem__,
                         lambda octets: np.frombuffer(octets, np.uint8), int)
+
+
+def built(types: MessageTypes, message: Message) -> Any:
+    """Build the message of an input topic."""
+    return action_trajectory(types, message) if isinstance(message, ActionMessage) else \
+        chain_cloud(types, message.chain, message.stamp, message.frame_id)
 
 
 def chain_cloud(types: MessageTypes, chain: Chain, stamp: int, frame_id: str) -> Any:

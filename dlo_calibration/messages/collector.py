@@ -41,32 +41,25 @@ from __future__ import annotations
 from bisect import bisect_right
 from dataclasses import replace
 from heapq import nlargest
-from itertools import pairwise
+from itertools import islice, pairwise
 import math
 from typing import Iterator, Sequence
 
+from dlo_calibration.calibration.choice import hand_warnings
 from dlo_calibration.calibration.options import names_of, OBSERVATION, Options
 from dlo_calibration.errors import InputError
-from dlo_calibration.messages.codec import (
-    ACTION,
-    ActionMessage,
-    ChainMessage,
-    GOAL,
-    INITIAL,
-    INPUT_TYPES,
-    Key,
-    Message,
-    NANOSECONDS,
-)
+from dlo_calibration.messages.codec import ACTION, ActionMessage, GOAL, INITIAL, Key, Message, NANOSECONDS
 from dlo_calibration.messages.trial_builder import TrialBuilder
 from dlo_calibration.model.named_actions import Manipulation
 from dlo_calibration.model.pose import Pose
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.observation.plausibility import implausible
+from dlo_calibration.observation.grips import GripEvidence
+from dlo_calibration.observation.plausibility import implausible, in_order, repeated
 
-USED = (*names_of(OBSERVATION), 'stable_distance', 'stable_time', 'settle_limit')  # options of messages
+USED = (*names_of(OBSERVATION), 'stable_distance', 'stable_time', 'settle_limit')  # options
 KEPT = 10_000  # messages that no trial uses: more than 5 minutes of a tracker at 30 Hz
 LATE = NANOSECONDS  # that goal chains from before the first initial chain may come late [ns]
+RECENT = 3  # trials before a new one that are compared with it
 MOST_MESSAGES = 200_000  # nearly two hours of a tracker at 30 Hz, which take about 450 MB
 MOST_NUMBERS = 20_000_000  # coordinates in them, which take 160 MB
 
@@ -92,9 +85,10 @@ class TrialCollector:
         self._room = KEPT  # messages until those that no trial uses are counted again
         self._exhausted = False  # whether nothing was left to forget when a message was too much
         self._forgotten: list[tuple[Key, Key]] = []  # the first key of each span, and the key after it
-        self._refusals: list[InputError] = []
+        self._new_refusals: list[InputError] = []
         self._warnings: list[str] = []
-        self._early: list[InputError] = []
+        self._early: list[str] = []
+        self._hands_seen = False  # whether a warning was given about errors of all hands
 
     def with_options(self, options: Options) -> tuple[TrialCollector, Iterator[int]]:
         """
@@ -116,7 +110,7 @@ class TrialCollector:
             try:
                 other.add(self._known[key])
             except InputError:
-                pass  # it is among `other.problems`
+                pass  # it is among `other.refusals`
             yield left
         for builder in discarded:
             other._leave_out(builder)
@@ -135,7 +129,7 @@ class TrialCollector:
         place = self._place(key)
         until = self._builders[place].until
         if until is not None and (message.kind != INITIAL or key <= until):
-            return  # it belongs to the discarded trial, of which a tracker may send more
+            return  # a tracker may send more of the discarded trial
         self._frame = message.frame_id
         self._known[key] = message
         self._numbers += _size(message)
@@ -146,7 +140,7 @@ class TrialCollector:
         self._newest = max(self._newest, key)
         if message.kind == INITIAL and self._builders[place].busy(key):
             if in_order:
-                self._refusals += self._builders[place].disturbed()
+                self._new_refusals += self._builders[place].disturbed()
             place += 1
             self._builders.insert(place, self._builders[place - 1].split(key))
         builder = self._builders[place]
@@ -159,11 +153,15 @@ class TrialCollector:
             self._builders[place].join(builder)
         if without_start and len(self._builders) > 1:
             streamed = all(waiting.kind == GOAL for waiting in self._builders[0].waiting)
-            (self._early if streamed else self._refusals).extend(self._orphans())
+            if streamed:
+                self._early += map(_early, self._orphans())
+            else:
+                self._new_refusals += self._orphans()
         elif not in_order and len(self._builders) > 1 and key < self._builders[1].first:
             error = self._no_start(message)
             if message.kind != ACTION and self._builders[1].first[0] - message.stamp <= LATE:
-                self._early.append(error)  # a tracker was on before, and is slower than the initial chain
+                # A tracker was on before, and is slower than the initial chain.
+                self._early.append(_early(error))
                 error = None
         self._room -= 1
         if self._room < 0:
@@ -177,16 +175,41 @@ class TrialCollector:
         builder = self._builders[place] if place < len(self._builders) else None
         if builder is None or not builder.due:
             return
-        before = next((other.trial for other in self._builders[place - 1:0:-1] if other.complete), None)
-        table = self._options.table_height if self._options.table else None
-
-        def warnings(number: int) -> tuple[str, ...]:
-            return implausible(builder.build(f'trial {number}'), table, bool(self._options.scene), before)
-
-        if texts := warnings(place):
+        wrong, losses = self._looked_at(place, place)
+        if wrong or losses:
             number = sum(other.complete for other in self._builders[:place + 1])
-            self._warnings += texts if number == place else warnings(number)
-            builder.warned = True
+            if number != place:
+                wrong, losses = self._looked_at(place, number)
+            self._warnings += (*wrong, *losses)
+            builder.warned |= bool(wrong)
+            builder.lost |= bool(losses)
+
+    def _looked_at(self, place: int, number: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """
+        Return what is implausible about the trial of a builder, and how its hands have lost the DLO.
+
+        What all hands have in common is among the warnings as soon as the recent trials show it.
+
+        :param number: of the trial.
+        """
+        builder, options = self._builders[place], self._options
+        complete = (self._builders[k] for k in range(place - 1, 0, -1) if self._builders[k].complete)
+        earlier = [other.build(f'trial {number - k}')
+                   for k, other in enumerate(islice(complete, RECENT), start=1)][::-1]
+        trial, before = builder.build(f'trial {number}'), None
+        wrong: tuple[str, ...] = ()
+        if not builder.warned:
+            for other in earlier:
+                before = in_order(other, before)
+            wrong = (*implausible(trial, options.table_top, bool(options.scene), before),
+                     *repeated(trial, earlier))
+        if builder.lost or trial.goals[-1].time < trial.hands[-1].end:
+            return wrong, ()
+        evidence = GripEvidence.of((*earlier, trial))
+        if not self._hands_seen and (texts := hand_warnings(evidence, options)):
+            self._hands_seen = True
+            self._warnings += texts
+        return wrong, tuple(str(loss) for loss in evidence.losses if loss.trial == trial.name)
 
     def take_back(self) -> tuple[int, int]:
         """
@@ -225,12 +248,12 @@ class TrialCollector:
         They are called ``trial 1``, ``trial 2``, ...; the errors say why actions are not used.
         """
         manipulations: list[Manipulation] = []
-        problems: list[InputError] = []
+        errors: list[InputError] = []
         for builder in self._builders[1:]:
-            manipulation, errors = builder.manipulation(f'trial {len(manipulations) + 1}')
+            manipulation, unused = builder.manipulation(f'trial {len(manipulations) + 1}')
             manipulations += [] if manipulation is None else [manipulation]
-            problems += errors
-        return tuple(manipulations), (*problems, *(self._orphans() if len(self._builders) == 1 else ()))
+            errors += unused
+        return tuple(manipulations), (*errors, *(self._orphans() if len(self._builders) == 1 else ()))
 
     @property
     def frame_id(self) -> str:
@@ -248,18 +271,18 @@ class TrialCollector:
         return self._builders[-1].missing()
 
     @property
-    def problems(self) -> tuple[InputError, ...]:
+    def refusals(self) -> tuple[InputError, ...]:
         """
         The reasons why messages are unused at present, and why earlier trials are incomplete.
 
         They include those that later messages caused, but not those that `take_refusals` returns.
         """
-        problems = [refusal.error for builder in self._builders for refusal in builder.refusals]
-        problems += [error for builder in self._builders for error in builder.disturbed()]
+        refusals = [refusal.error for builder in self._builders for refusal in builder.refusals]
+        refusals += [error for builder in self._builders for error in builder.disturbed()]
         for builder, following in pairwise(each for each in self._builders[1:] if each.until is None):
-            problems += builder.incomplete(f'and {following.starts[0]}',
+            refusals += builder.incomplete(f'and {following.starts[0]}',
                                            'send no initial chain before the trial is complete')
-        return tuple(problems)
+        return tuple(refusals)
 
     @property
     def loose_end(self) -> tuple[InputError, ...]:
@@ -270,16 +293,16 @@ class TrialCollector:
 
     def take_refusals(self) -> tuple[InputError, ...]:
         """Return, once, the refusals of waiting messages since the last call."""
-        refusals, self._refusals = self._refusals, []
+        refusals, self._new_refusals = self._new_refusals, []
         return tuple(refusals)
 
     def take_warnings(self) -> tuple[str, ...]:
-        """Return, once, what is implausible about trials, as far as it was noticed since the last call."""
+        """Return, once, the warnings about trials and their hands since the last call."""
         warnings, self._warnings = self._warnings, []
         return tuple(warnings)
 
-    def take_early(self) -> tuple[InputError, ...]:
-        """Return, once, the refusals of goal chains that came before any action or initial chain."""
+    def take_early(self) -> tuple[str, ...]:
+        """Return, once, notes about goal chains that came before any action or initial chain."""
         early, self._early = self._early, []
         return tuple(early)
 
@@ -303,12 +326,11 @@ class TrialCollector:
         if key not in self._known:
             return
         builder = self._builders[self._place(key)]
-        refused = builder.refused(key)
-        if refused is None:
+        refusal = builder.refusals.at(key)
+        if refusal is None:
             raise InputError(str(message), f'a second {message.kind} with this stamp', 'one',
                              'stamp every message with its own time, or reset to begin anew')
-        self._drop([refused])
-        builder.remove([refused])
+        builder.remove(self._drop([refusal.message]))
 
     def _full(self, message: Message) -> bool:
         """Return whether there is no room for a message."""
@@ -331,18 +353,18 @@ class TrialCollector:
         waiting = self._builders[0].waiting
         return (self._no_start(waiting[0], len(waiting) - 1),) if waiting else ()
 
-    def _forget(self, rest: int) -> None:
+    def _forget(self, limit: int) -> None:
         """
-        Forget the oldest messages that no trial uses until `rest` of them are left.
+        Forget the oldest messages that no trial uses until `limit` of them are left.
 
-        Where `rest` is not 0, nothing is forgotten unless there are more than KEPT.
+        Where `limit` is not 0, nothing is forgotten unless there are more than KEPT.
         """
         spare = sum(builder.spare for builder in self._builders)
-        surplus = spare - rest if spare > KEPT or not rest else 0
-        kept: list[TrialBuilder] = []
+        surplus = spare - limit if spare > KEPT or not limit else 0
+        remaining: list[TrialBuilder] = []
         for builder, following in zip(self._builders, [*self._builders[1:], None], strict=True):
             if surplus <= 0:
-                kept.append(builder)
+                remaining.append(builder)
                 continue
             forgotten = builder.spare
             if builder.starts and not builder.complete and following is not None:
@@ -351,10 +373,10 @@ class TrialCollector:
             else:
                 self._trim(builder, surplus)
                 forgotten -= builder.spare
-                kept.append(builder)
+                remaining.append(builder)
             surplus -= forgotten
             spare -= forgotten
-        self._builders, self._room = kept, KEPT - spare
+        self._builders, self._room = remaining, KEPT - spare
 
     def _trim(self, builder: TrialBuilder, surplus: int) -> None:
         """Forget the oldest spare messages of a builder that stays."""
@@ -384,13 +406,17 @@ class TrialCollector:
 
     def _close(self, begin: Key, end: Key) -> None:
         """Refuse from now on messages with keys from `begin` up to, but not including, `end`."""
-        apart: list[tuple[Key, Key]] = []
+        separate: list[tuple[Key, Key]] = []
         for span in self._forgotten:
             if span[1] < begin or end < span[0]:
-                apart.append(span)
+                separate.append(span)
             else:
                 begin, end = min(begin, span[0]), max(end, span[1])
-        self._forgotten = [*apart, (begin, end)]
+        self._forgotten = [*separate, (begin, end)]
+
+
+def _early(error: InputError) -> str:
+    return f'{error.thing}: came before the first initial chain; not used'
 
 
 def _size(message: Message) -> int:
@@ -405,7 +431,7 @@ def _moved(message: Message, pose: Pose) -> Message:
     if isinstance(message, ActionMessage):
         return replace(message, positions=pose.points(message.positions),
                        orientations=pose.orientations(message.orientations))
-    return ChainMessage(message.kind, message.stamp, message.frame_id, pose.chain(message.chain))
+    return replace(message, chain=pose.chain(message.chain))
 
 
 # [ns] Two trackers on one topic may differ by less; a restarted clock goes back further.
@@ -437,7 +463,7 @@ class StampOrder:
         self._first: float = math.inf  # of the initial chains
         self._former_end = 0 if former is None else former.newest
         self._former_newest = {} if former is None else {  # of the topics that have not yet gone back
-            kind: former._newest.get(kind, 0) for kind in INPUT_TYPES}
+            kind: former._newest.get(kind, 0) for kind in (INITIAL, ACTION, GOAL)}
 
     @property
     def newest(self) -> int:

@@ -18,7 +18,7 @@ from dlo_calibration.model.chain import Chain, Floats, MINIMUM_SPACING
 from dlo_calibration.model.trial import Goal, Trial
 
 SAME_OFFSET = 1e-3  # of a segment
-BEFORE = NANOSECONDS // 100  # from the chain that gives a velocity to the initial chain
+BEFORE = NANOSECONDS // 100  # time between the two initial chains that give a velocity
 
 
 def trial_messages(trials: Sequence[Trial], frame_id: str) -> list[Message]:
@@ -26,10 +26,10 @@ def trial_messages(trials: Sequence[Trial], frame_id: str) -> list[Message]:
     Return messages from which a `TrialCollector` makes the same trials, to a nanosecond.
 
     A hand that keeps holding the DLO during a later action takes part in it, at rest.
-    Three cases cannot be sent, and are lost: two hands that grip one point of a chain, a
-    hand that closes far from its point in the latest chain before the action, where other
-    hands act alone between that chain and the action, and a hand that holds the DLO in a goal,
-    but moved beyond the beginning of another hand's last action.
+    Three cases cannot be sent, and are lost: two hands that grip one point of a chain; a hand
+    that closes far from its point in the latest chain, if other hands act alone between that
+    chain and its action; and a hand that holds the DLO in a goal, but still moved when
+    another hand's last action began.
     """
     messages: list[Message] = []
     zero = 1_700_000_000 * NANOSECONDS  # a time in 2023, as real stamps are
@@ -92,50 +92,51 @@ def _numbered(trial: Trial, groups: list[tuple[Hand, ...]]) -> tuple[list[tuple[
     """
     Return the groups, with their hands in the order to send, and the initial chain with numbers of hands.
 
-    The numbers are those of the first group where this tells the grips of all groups before the first goal.
-    Else only those grips get a number that the place of the hand does not tell.
+    The numbers are those of the first group if they give the grips of all groups before the first goal.
+    Else, only grips that a hand's place does not give get a number.
     """
     initial, first_goal = trial.initial, min(goal.time for goal in trial.goals)
     early = [hands for hands in groups if hands[0].start <= first_goal]
-    annotated = _annotated(initial, groups[0], [hand.name for hand in groups[0]
-                                                if not hand.offset or not _tells_by_place(initial, hand)])
-    if all(_tells(annotated, hands) for hands in early):
+    annotated = _annotated(initial, groups[0], [
+        hand.name for hand in groups[0]
+        if not (hand.offset or hand.nearest) or not _grips_nearest(initial, hand)])
+    if all(_give_grips(annotated, hands) for hands in early):
         return groups, annotated
-    needed = Counter(hand.grips for hands in early for hand in hands if not _tells_by_place(initial, hand))
+    needed = Counter(hand.grips for hands in early for hand in hands if not _grips_nearest(initial, hand))
     numbers = np.zeros(len(initial), np.uint8)
     order = [grips for grips, _ in needed.most_common()]
     for k, grips in enumerate(order, start=1):
         numbers[list(grips)] = k
     renumbered = replace(initial, hands=numbers)
     place = {grips: k for k, grips in enumerate(order)}
-    sorted_ = [tuple(sorted(hands, key=lambda hand: place.get(hand.grips, len(place)))) for hands in early]
-    if all(_tells(renumbered, hands) for hands in sorted_):
-        return [*sorted_, *groups[len(early):]], renumbered
+    ordered = [tuple(sorted(hands, key=lambda hand: place.get(hand.grips, len(place)))) for hands in early]
+    if all(_give_grips(renumbered, hands) for hands in ordered):
+        return [*ordered, *groups[len(early):]], renumbered
     return groups, annotated
 
 
-def _tells(chain: Chain, hands: Sequence[Hand]) -> bool:
-    """Return whether an annotated chain, and the places of the hands, give the points that hands grip."""
+def _give_grips(chain: Chain, hands: Sequence[Hand]) -> bool:
+    """Return whether an annotated chain and the places of the hands give their grips."""
     for k, hand in enumerate(hands, start=1):
         held = np.flatnonzero(chain.hands == k)
         if (tuple(held.tolist()) != tuple(sorted(hand.grips)) or hand.offset) if len(held) else \
-                not _tells_by_place(chain, hand):
+                not _grips_nearest(chain, hand):
             return False
     return True
 
 
-def _tells_by_place(chain: Chain, hand: Hand) -> bool:
-    """Return whether a hand closes at the one place of a chain that it grips."""
+def _grips_nearest(chain: Chain, hand: Hand) -> bool:
+    """Return whether a hand grips only the place of a chain at which it closes."""
     point, offset, distance = chain.nearest(hand.positions[0])
     return hand.grips == (point,) and abs(hand.offset - offset) < SAME_OFFSET and distance <= (
-        Options().grip_tolerance if hand.offset else MINIMUM_SPACING)
+        Options().grip_tolerance if hand.offset or hand.nearest else MINIMUM_SPACING)
 
 
 def _at_rest(hand: Hand, start: float, end: float) -> Hand:
     """Return the path of a hand that stays at the last pose of `hand`."""
     times = [start, end] if end > start else [start]
     return Hand(hand.name, hand.grips, np.array(times), np.repeat(hand.positions[-1:], len(times), axis=0),
-                np.repeat(hand.orientations[-1:], len(times), axis=0), hand.offset)
+                np.repeat(hand.orientations[-1:], len(times), axis=0), hand.offset, hand.nearest)
 
 
 def _annotated_goal(trial: Trial, goal: Goal, groups: Sequence[tuple[Hand, ...]]) -> Chain:

@@ -57,9 +57,9 @@ class Refusals:
         name = reason(text)
         if name not in self._reasons and len(self._reasons) >= MOST_REASONS:
             name = OTHER
-        known = self._reasons.setdefault(name, _Reason(text))
-        known.text, known.count = text, known.count + 1
-        return str(known)
+        entry = self._reasons.setdefault(name, _Reason(text))
+        entry.text, entry.count = text, entry.count + 1
+        return str(entry)
 
     def due(self, now: float) -> list[str]:
         """Return the reports that are due at the time `now` [s]."""

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The given things: chains, actions, trials, parameters, and the scores that compare chains."""
+"""Chains, actions, trials, parameters, and the scores that compare chains."""
 
 from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain

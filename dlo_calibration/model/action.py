@@ -15,7 +15,7 @@ from dlo_calibration.errors import InputError
 from dlo_calibration.model.chain import check_size, Floats, frozen_array
 
 MAXIMUM_HANDS = 8  # the limit of the message contract
-MAXIMUM_TIME = 1e12  # s; far more than between two stamps, and steps up to it can be counted
+MAXIMUM_TIME = 1e12  # s; far more than between two stamps, and still countable in time steps
 PATHS = 'hand_paths'  # name of explicit paths
 NO_ROTATION = (0.0, 0.0, 0.0, 1.0)  # x y z w
 
@@ -23,12 +23,11 @@ NO_ROTATION = (0.0, 0.0, 0.0, 1.0)  # x y z w
 def quaternion_lengths(orientations: Floats) -> Floats:
     """Return the lengths of (..., 4) quaternions, also of those whose squares overflow."""
     largest = np.abs(orientations).max(axis=-1, initial=1.0)
-    lengths: Floats = largest * np.linalg.norm(orientations / largest[..., None], axis=-1)
-    return lengths
+    return np.asarray(largest * np.linalg.norm(orientations / largest[..., None], axis=-1))
 
 
 def far_from_unit(lengths: Floats) -> NDArray[np.bool_]:
-    """Return which lengths no rotation can be meant by; quaternions that were rounded are normalised."""
+    """Return which lengths are too far from 1 for a rotation; rounded quaternions are normalised."""
     return (lengths < 0.5) | (lengths > 1000)
 
 
@@ -45,7 +44,7 @@ def check_waypoints(thing: str, what: str, names: Sequence[str], paths: Mapping[
     """
     Refuse paths that hands cannot follow.
 
-    :param thing: their owner in the error, `what` a waypoint is called there, and `names` of the h hands.
+    :param thing: their owner in the error; `what`: the word for a waypoint; `names` of the h hands.
     :param paths: (k,) times [s], (k, ...) positions [m] and (k, h, 4) quaternions, by their names.
     :param step: least time from one waypoint to the next [s].
     :raises InputError: if a number is not finite or too large, times do not increase, or a quaternion is far
@@ -86,8 +85,10 @@ class Hand:
     :param times: (k,) seconds since the start of the trial, increasing, k >= 1.
     :param positions: (k, 3) [m], at most `MAXIMUM_COORDINATE`.
     :param orientations: (k, 4) unit quaternions x y z w; None for no rotation.
-    :param offset: a pin between two points is so far beyond the gripped one, as a share of the way to the
-        next one, -1 to 1; negative: to the one before.
+    :param offset: of a pin between two points: distance beyond the gripped one, as a share of the way to the
+        next one, -1 to 1; negative: to the previous one.
+    :param nearest: whether it grips where the DLO is nearest to its first waypoint; `grips` and `offset` say
+        where that is.
     """
 
     name: str
@@ -96,6 +97,7 @@ class Hand:
     positions: Floats
     orientations: Floats = None  # type: ignore[assignment]  # __post_init__ makes it an array
     offset: float = 0.0
+    nearest: bool = False
 
     def __post_init__(self) -> None:
         thing = f'hand {self.name!r}'
@@ -194,9 +196,9 @@ class Action:
 
 def check_grips(thing: str, hands: Iterable[Hand], count: int) -> None:
     """
-    Refuse hands that grip points that a chain does not have.
+    Refuse hands that grip points beyond the chain.
 
-    :param thing: with these hands, in the error.
+    :param thing: the owner of the hands in the error.
     :param count: number of points of the chain.
     :raises InputError: if there is such a hand.
     """

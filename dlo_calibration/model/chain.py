@@ -18,10 +18,10 @@ from dlo_calibration.errors import InputError
 Floats = NDArray[np.float64]
 
 MAXIMUM_COORDINATE = 1e8  # m; bytes read in the wrong order give more, and squares must not overflow
-#: Of a chain, as many as a simulated DLO has nodes at most; finding their noise takes as long as the cube.
+#: Of a chain: the largest number of simulated nodes; the time to estimate the noise grows with the cube.
 MOST_POINTS = 1000
 MINIMUM_SPACING = 1e-6  # m; nearer points are the same point
-NEAR = 0.02  # of a segment; a hand that grips so near to a point grips that point
+NEAR = 0.02  # of a segment; a hand that grips nearer to a point than this grips that point
 SAMPLES_PER_SEGMENT = 16  # of the arc length table; its error is below 1e-4 of a segment
 
 
@@ -85,11 +85,11 @@ def interpolation_matrix(knots: Floats, at: Floats) -> Floats:
     return bezier_curve(knots, np.eye(len(knots)), at)
 
 
-def put_back(points: Floats, seen: NDArray[np.bool_], places: Floats) -> Floats:
+def interpolate_unseen(points: Floats, seen: NDArray[np.bool_], places: Floats) -> Floats:
     """
-    Return (n, 3) points [m] whose unseen ones lie on the curve through the others, see `bezier_curve`.
+    Return (n, 3) points [m] with the unseen ones moved onto the curve through the others, see `bezier_curve`.
 
-    Beyond the first and the last seen point, the DLO goes on straight.
+    Beyond the first and the last seen point, the DLO continues straight.
 
     :param seen: (n,) which points were seen, at least three.
     :param places: (n,) increasing; arc lengths of the points, in any unit.
@@ -109,17 +109,17 @@ def put_back(points: Floats, seen: NDArray[np.bool_], places: Floats) -> Floats:
 @dataclass(frozen=True, eq=False)
 class Chain:
     """
-    Ordered points along a DLO, first to last; it equals only itself.
+    Ordered points along a DLO, first to last; each chain equals only itself.
 
-    A point with NaN was not seen.  If at least half of the points were, and three, it is put back, see
-    `put_back`, as if the points were equally spaced.
+    A point with NaN was not seen; it is interpolated as if the points were equally spaced, see
+    `interpolate_unseen`.  At least three points, and half of them, must be seen.
 
     :param points: (n, 3) positions [m], 3 <= n <= MOST_POINTS, at most MAXIMUM_COORDINATE, neighbours apart;
         in the chain, all are finite.
     :param hands: (n,) number of the hand that holds each point, 0 for none; or
         None where the source does not annotate it.
     :param features: (n,) True where an annotator marked a geometric feature.
-    :param seen: (n,) False for points that were not seen; None: all that are not NaN were.
+    :param seen: (n,) False for points that were not seen; None: those with NaN were not.
     """
 
     points: Floats
@@ -165,7 +165,7 @@ class Chain:
         object.__setattr__(self, 'seen', frozen_array(seen, bool))
         if not given.all():
             places = np.arange(float(len(points)))
-            object.__setattr__(self, 'points', frozen_array(put_back(points, seen, places)))
+            object.__setattr__(self, 'points', frozen_array(interpolate_unseen(points, seen, places)))
         if self.hands is not None:
             object.__setattr__(self, 'hands', self._annotation('hands', self.hands, np.uint8))
         features = np.zeros(len(points), bool) if self.features is None else self.features
@@ -188,19 +188,19 @@ class Chain:
         return self.points if self.seen.all() else frozen_array(
             np.where(self.seen[:, None], self.points, np.nan))
 
-    def put_back(self, places: Floats, known: Mapping[int, Floats] = MappingProxyType({})) -> Chain:
+    def interpolated(self, places: Floats, others: Mapping[int, Floats] = MappingProxyType({})) -> Chain:
         """
-        Return the chain, its unseen points put back.
+        Return the chain with its unseen points interpolated.
 
         :param places: arc lengths of all points, (n,) in any unit.
-        :param known: where unseen points are nevertheless known to be, (3,) [m] by their index.
+        :param others: positions of unseen points from another source, (3,) [m] by their index.
         """
         if self.seen.all():
             return self
         points, seen = np.array(self.points), np.array(self.seen)
-        for k, point in known.items():
+        for k, point in others.items():
             points[k], seen[k] = point, True
-        points = put_back(points, seen, places)
+        points = interpolate_unseen(points, seen, places)
         return self if np.array_equal(points, self.points) else replace(self, points=points)
 
     @property
@@ -248,7 +248,7 @@ class Chain:
         return point, offset if abs(offset) > NEAR else 0.0
 
     def gripped(self, grips: Sequence[int], offset: float) -> Floats:
-        """Return where a hand grips, (k, 3) [m]: `grips` are its points, see `grip_place` for the offset."""
+        """Return the gripped places, (k, 3) [m]; `grips` are points, see `grip_place` for the offset."""
         if offset == 0:
             return np.asarray(self.points[list(grips)])
         return self.resample([grip_place(self.arc_lengths(), grip, offset) for grip in grips])
@@ -276,8 +276,8 @@ def grip_place(places: Floats, point: int, offset: float) -> float:
     Return the arc length [m] at which a hand grips, between two points.
 
     :param places: (n,) arc lengths of the points [m].
-    :param offset: how far beyond the point it is, as a share of the way to the next one, at most 1; negative:
-        to the one before. The DLO ends at its last point.
+    :param offset: distance beyond the point, as a share of the way to the next one, at most 1; negative: to
+        the previous one. The DLO ends at its last point.
     """
     beside = min(max(point + (1 if offset > 0 else -1), 0), len(places) - 1)
     return float(places[point] + abs(offset) * (places[beside] - places[point]))
@@ -285,7 +285,7 @@ def grip_place(places: Floats, point: int, offset: float) -> float:
 
 def check_ends(thing: str, initial: Chain) -> None:
     """
-    Refuse an initial chain that does not show where an end of the DLO is.
+    Refuse an initial chain that does not show both ends of the DLO.
 
     :raises InputError: if more than one point at an end was not seen; `thing` is named.
     """
@@ -297,7 +297,7 @@ def check_ends(thing: str, initial: Chain) -> None:
 
 
 def length_change(start: Chain, goal: Chain) -> float:
-    """Return by how much the length of a goal differs from the start's [%], where neighbours were seen."""
+    """Return the relative difference of length between start and goal [%], where neighbours were seen."""
     pairs = goal.seen[1:] & goal.seen[:-1]
     if pairs.all() or not pairs.any():
         return abs(goal.length - start.length) / start.length * 100

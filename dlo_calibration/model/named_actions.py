@@ -6,7 +6,7 @@ Named actions: short descriptions of what hands do, from which their paths follo
 
 A message always carries the paths themselves.  A named action computes them from the
 chain before it: each hand closes at the point that it grips, and moves at constant
-speed.  With `hold` it keeps holding the DLO afterwards.
+speed.  With `hold`, it holds the DLO afterwards, too.
 
 The position of a hand [m] is that of the point that it grips.  This point is given
 as an index of the chain (negative: from its end), or as a fraction of the length,
@@ -18,7 +18,7 @@ The docstring of each action says how much it shows of each of the paper's four 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import ClassVar, Iterable, Mapping, Sequence, Union
 
 import numpy as np
@@ -68,8 +68,7 @@ class NamedAction:
     @property
     def hand_names(self) -> tuple[str, ...]:
         """Names of the hands that it uses."""
-        hands: tuple[str, ...] = vars(self)['hands'] if 'hands' in vars(self) else (vars(self)['hand'],)
-        return hands
+        return tuple(vars(self)['hands'] if 'hands' in vars(self) else (vars(self)['hand'],))
 
     def action(self, chain: Chain, before: Sequence[Action] = ()) -> Action:
         """
@@ -171,8 +170,7 @@ class _Carrying(_OneHand):
             return np.array(self.to)
         # Divide by the largest component first: squares of huge or tiny numbers overflow or vanish.
         direction = np.array(self.direction) / np.abs(self.direction).max()  # type: ignore[arg-type]
-        target: Floats = point + direction / np.linalg.norm(direction) * self.distance
-        return target
+        return np.asarray(point + direction / np.linalg.norm(direction) * self.distance)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -317,11 +315,11 @@ class TwoHands(NamedAction):
                 raise self._refused(f'{len(values)} {name}', '2', 'give one for each hand')
         if self.fractions is not None:
             object.__setattr__(self, 'fractions', tuple(map(float, self.fractions)))
-        for name, value, known in (('motion', self.motion, ('apart', 'together')),
+        for name, value, permitted in (('motion', self.motion, ('apart', 'together')),
                                    ('moving', self.moving, tuple(MOVING))):
-            if value not in known:
-                raise self._refused(f'{name} {value!r}', one_of(known, value),
-                                    suggestion(value, known, 'correct the action'))
+            if value not in permitted:
+                raise self._refused(f'{name} {value!r}', one_of(permitted, value),
+                                    suggestion(value, permitted, 'correct the action'))
 
     def action(self, chain: Chain, before: Sequence[Action] = ()) -> Action:
         """Return the paths of both hands, whose waypoints have the same times."""
@@ -422,7 +420,7 @@ class Manipulation:
     A DLO at rest, and the actions to do with it in turn.
 
     :param start: the DLO before the first action.
-    :param steps: one or more, at most MOST_STEPS; each begins when the DLO rests after the one before.
+    :param steps: one or more, at most MOST_STEPS; each begins when the DLO rests after the previous one.
     :param warnings: sentences for the user: what differs from the request or the recording.
     """
 
@@ -441,6 +439,28 @@ class Manipulation:
         check_ends(thing, self.start)
         check_grips(thing, [hand for step in self.steps for action in step.actions
                             if isinstance(action, Action) for hand in action.hands], len(self.start))
+
+    def with_shifted_hands(self, shift: Floats) -> Manipulation:
+        """
+        Return the manipulation with the recorded hands where they really were, if they are off by `shift`.
+
+        :param shift: (3,) [m]. A hand that grips the nearest place of the start grips where that is then;
+            named actions say where the DLO goes, and stay.
+        """
+        def shifted(hand: Hand) -> Hand:
+            grips, offset = hand.grips, hand.offset
+            if hand.nearest:
+                point, offset, _ = self.start.nearest(hand.positions[0] - shift)
+                grips = (point,)
+            return replace(hand, grips=grips, offset=offset, positions=hand.positions - shift)
+
+        def moved(action: Union[NamedAction, Action]) -> Union[NamedAction, Action]:
+            if isinstance(action, RecordedPaths):
+                return replace(action, positions=action.positions - shift)
+            return Action(tuple(map(shifted, action.hands))) if isinstance(action, Action) else action
+
+        return replace(self, steps=tuple(replace(step, actions=tuple(map(moved, step.actions)))
+                                         for step in self.steps))
 
 
 @dataclass(frozen=True)
@@ -469,8 +489,8 @@ def manipulation_of(name: str, start: Chain, actions: Iterable[TimedAction],
 
     Actions of different hands that overlap in time are one step.
 
-    :param holding: times [s] of observations in order, and the names of the hands that hold the DLO then;
-        None: those that still hold it after their actions.
+    :param holding: times [s] of observations in order, with the names of the hands that hold the DLO then;
+        None: the hands that hold it after their actions.
     """
     groups: list[list[TimedAction]] = []
     warnings = []

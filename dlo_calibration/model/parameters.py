@@ -6,8 +6,8 @@ Parameters: their values on the paper's scale from 0 to 100, and their physical 
 
 The package computes in SI units; the scale from 0 to 100 exists here and at the
 edges (messages, files, tables).  A new parameter is one more entry of PARAMETERS;
-an engine reads its physical value by name.  The formulas at the end say what the parameters of bending
-mean for a piece of DLO: the shape that nothing bends, and the moment that bends it.
+an engine reads its physical value by name.  The formulas at the end define the parameters of bending for a
+piece of DLO: the rest shape, and the moment that bends it.
 """
 
 from __future__ import annotations
@@ -32,36 +32,43 @@ def exact(value: Any) -> str:
     return str(value) if isinstance(value, (int, str)) else repr(float(value))
 
 
-def number(value: float | None) -> str:
+def number(value: float | None, beside: float | None = None) -> str:
     """
     Return a number with three significant digits, for people; a dash where it is unknown.
 
     Only a very large or very small number has a power of ten.
+
+    :param beside: a number next to it in a text: both have the power of ten of the larger one.
     """
     if value is None or not math.isfinite(value):
         return '-'
     if value == 0:
         return '0'  # -0.0, too
-    if 1e-5 <= abs(value) < 1e6:
-        return np.format_float_positional(value, precision=3, unique=False, fractional=False, trim='-')
-    return f'{value:.3g}'
+    largest = max(abs(value), abs(beside) if beside is not None and math.isfinite(beside) else 0.0)
+    exponent = 0 if 1e-3 <= largest < 1e6 else int(f'{largest:.2e}'.partition('e')[2])
+    digits = np.format_float_positional(
+        value / 10.0**exponent, precision=3, unique=False, fractional=False, trim='-')
+    return f'{digits}e{exponent}' if exponent else digits
 
 
-def measured(value: float | None, unit: str) -> str:
-    """Return a physical value (SI) with its unit, for people: lengths in mm, coefficients without unit."""
-    return _with_unit([value], unit)
+def measured(value: float | None, unit: str, beside: float | None = None) -> str:
+    """
+    Return a physical value (SI) with its unit, for people: lengths in mm, coefficients without unit.
+
+    :param beside: see `number`: for a value next to its interval, the end that is further from 0.
+    """
+    return _with_unit([value], unit, beside)
 
 
 def interval(lower: float | None, upper: float | None, unit: str) -> str:
     """Return both ends of an interval (SI) with their unit, as `measured` writes one value."""
-    return _with_unit([lower, upper], unit)
+    return _with_unit([lower, upper], unit, max(lower or 0.0, upper or 0.0, key=abs))
 
 
-def _with_unit(values: Sequence[float | None], unit: str) -> str:
-    if unit == 'm':
-        values, unit = [None if value is None else 1e3 * value for value in values], 'mm'
-    text = ' to '.join(map(number, values))
-    return text if unit == '1' else f'{text} {unit}'
+def _with_unit(values: Sequence[float | None], unit: str, beside: float | None) -> str:
+    factor, name = (1e3, 'mm') if unit == 'm' else (1.0, unit)
+    text = ' to '.join(number(value and factor * value, beside and factor * beside) for value in values)
+    return text if unit == '1' else f'{text} {name}'
 
 
 SCALE = 100.0  # the upper end of the paper's scale
@@ -123,11 +130,11 @@ class Parameter:
             return interval(physical[0], physical[1], unit)
         grows = self.at_hundred > self.at_zero
         return f'at most {measured(physical[1], unit)}' if (lower <= 0) == grows else \
-            f'at least {measured(physical[0], unit)}'
+            f'at least {measured(physical[0], unit, physical[1])}'
 
 
 MOST_PARTS = 8  # with bending stiffnesses of their own: the DLO can be halved three times
-KNOTS = (3, 5, 9)  # of a rest shape that varies: each has the places of the one before and those between
+KNOTS = (3, 5, 9)  # of a rest shape that varies: each number keeps the places of the previous one
 
 
 def part_name(part: int) -> str:
@@ -171,6 +178,11 @@ PARAMETERS: tuple[Parameter, ...] = (
     *(Parameter(part_name(part), f'bending stiffness of part {part} relative to part 1', '1', 0.02, 50.0,
                 50.0, f'how stiff part {part} of the DLO is (see parts)', neutral=1.0)
       for part in range(2, MOST_PARTS + 1)),
+    Parameter('hand_delay', 'delay of the stamps of actions', 's', -0.4, 0.4, 50.0,
+              'by how much the stamps of actions are late', linear=True, neutral=0.0),
+    *(Parameter(f'hand_shift_{axis}', f'shift of the hands in {axis}', 'm', -0.05, 0.05, 50.0,
+                f'by how much hands are off in {axis} of the frame of the chains', linear=True, neutral=0.0)
+      for axis in 'xyz'),
     Parameter('clamp_twist', 'angle between rest shape and second clamp', 'rad', -2 * math.pi, 2 * math.pi,
               50.0, 'how the DLO was turned about its axis when it was put into the second clamp (see parts)',
               linear=True, neutral=0.0),
@@ -180,12 +192,14 @@ PARAMETERS: tuple[Parameter, ...] = (
 )
 BY_NAME: Mapping[str, Parameter] = {parameter.name: parameter for parameter in PARAMETERS}
 PART_NAMES = tuple(part_name(part) for part in range(2, MOST_PARTS + 1))
+#: Of the hands, not of the DLO.
+HANDS = ('hand_delay', 'hand_shift_x', 'hand_shift_y', 'hand_shift_z')
 REST_SHAPE = ('clamp_twist', *knot_names(KNOTS[-1]))
 PAPER_PARAMETERS = ('flexibility', 'elasticity', 'friction', 'self_collision')
 
 
 def _absent_knots(knots: int) -> tuple[str, ...]:
-    """Return the names of the rest shape's parameters that a DLO with that number of knots does not have."""
+    """Return the names of the rest shape's parameters that a DLO with this number of knots lacks."""
     return REST_SHAPE[1 + 2 * knots:] if knots else REST_SHAPE
 
 
@@ -194,9 +208,9 @@ class ParameterSpace:
     """
     The parameters that a calibration finds, and the values of the others.
 
-    The DLO has k parts of equal length where `stiffness_k` is the highest such name
-    that is free or fixed; it has one part where there is none. Likewise, its rest shape
-    has the number of knots of `KNOTS` that the highest such name needs.
+    The DLO has k parts of equal length if `stiffness_k` is the highest such name that is
+    free or fixed; without any, it has one part. Likewise, its rest shape has the number
+    of knots of `KNOTS` that the highest such name needs.
 
     :param free: names of the parameters to find, in order.
     :param fixed: values of others on the 0..100 scale; the rest keep their defaults.
@@ -236,7 +250,7 @@ class ParameterSpace:
 
     @property
     def knots(self) -> int:
-        """Number of knots of the rest shape, of `KNOTS`; 0: it is straight, or `natural_curvature` is all."""
+        """Number of knots of the rest shape, of `KNOTS`; 0: its curvature is constant."""
         present = {*self.free, *self.fixed}
         if not present.intersection(REST_SHAPE):
             return 0
@@ -244,8 +258,9 @@ class ParameterSpace:
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """The entries of PARAMETERS, without those of parts and knots that this DLO does not have."""
-        absent = {*PART_NAMES[self.parts - 1:], *_absent_knots(self.knots)}
+        """The entries of PARAMETERS, without those of parts, knots and hands that are not in the space."""
+        absent = {*PART_NAMES[self.parts - 1:], *_absent_knots(self.knots),
+                  *set(HANDS).difference(self.free, self.fixed)}
         return tuple(parameter for parameter in PARAMETERS if parameter.name not in absent)
 
     def divided(self, parts: int) -> ParameterSpace:
@@ -291,8 +306,8 @@ class ParameterSpace:
                                      if name not in REST_SHAPE}).shaped(knots)
         for axis in 'xy' if now else '':
             names = [f'rest_curvature_{axis}{knot}' for knot in range(1, max(knots, now) + 1)]
-            known = [values.get(name, BY_NAME[name].default) for name in names[:now]]
-            between = np.interp(np.linspace(0, 1, knots), np.linspace(0, 1, now), known)
+            components = [values.get(name, BY_NAME[name].default) for name in names[:now]]
+            between = np.interp(np.linspace(0, 1, knots), np.linspace(0, 1, now), components)
             values.update(zip(names[:knots], between.tolist(), strict=True))
         return space, space.point({name: values.get(name, BY_NAME[name].default) for name in space.free})
 
@@ -349,9 +364,9 @@ def natural_curvature(physical: Mapping[str, float], fractions: Floats) -> Float
     """
     curvature = np.zeros((len(fractions), 2))
     curvature[:, 0] = physical.get('natural_curvature', 0.0)
-    known = [physical[name] for name in knot_names(KNOTS[-1]) if name in physical]
-    for axis in range(2 if known else 0):
-        values = known[axis::2]
+    components = [physical[name] for name in knot_names(KNOTS[-1]) if name in physical]
+    for axis in range(2 if components else 0):
+        values = components[axis::2]
         curvature[:, axis] += np.interp(fractions, np.linspace(0, 1, len(values)), values)
     return curvature
 

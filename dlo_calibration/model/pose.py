@@ -45,9 +45,9 @@ class Pose:
     @classmethod
     def of(cls, text: str) -> Self:
         """
-        Return the pose that seven numbers give, as `str` writes them.
+        Return the pose from a text with seven numbers, as `str` writes it.
 
-        :raises InputError: if the text is not that.
+        :raises InputError: if the text is something else.
         """
         try:
             numbers = [float(word) for word in text.split()]
@@ -99,7 +99,8 @@ class Pose:
     def action(self, action: Action) -> Action:
         """Return the paths of hands of the frame in the other one."""
         return Action(tuple(Hand(hand.name, hand.grips, hand.times, self.points(hand.positions),
-                                 self.orientations(hand.orientations), hand.offset) for hand in action.hands))
+                                 self.orientations(hand.orientations), hand.offset, hand.nearest)
+                            for hand in action.hands))
 
     def named_action(self, action: NamedAction) -> NamedAction:
         """Return a named action of the frame for the other one, whose z is up."""

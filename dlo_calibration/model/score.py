@@ -16,6 +16,8 @@ from dlo_calibration.model.trial import Trial
 
 SIMILAR = 100.0  # cm; the paper's judges call chains with lower scores similar
 VERY_SIMILAR = 50.0  # cm, likewise
+#: Mean length of a vector of three normal coordinates with standard deviation 1 (Maxwell distribution).
+MEAN_DISTANCE = float(np.sqrt(8 / np.pi))
 
 
 def focal_points(trial: Trial) -> NDArray[np.intp]:
@@ -46,7 +48,7 @@ def feature_points(trial: Trial) -> NDArray[np.bool_]:
     Return which points of each goal are geometric features, (g, n).
 
     They are local maxima and minima in z, points that a hand has gripped, and
-    points that an annotator marked, as far as they were seen.
+    points that an annotator marked, if they were seen.
     """
     features = np.stack([goal.chain.features for goal in trial.goals]) | trial.initial.features
     rise = np.sign(np.diff(observed(trial)[:, :, 2], axis=1))
@@ -100,7 +102,7 @@ class TrialScore:
     """
     The difference score of one trial; the terms of its goals are computed once.
 
-    Points of goals that were not seen are left out of all sums.
+    No sum contains unseen points of goals.
     """
 
     def __init__(self, trial: Trial) -> None:

@@ -6,8 +6,9 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 import math
 from typing import Sequence
 
@@ -17,7 +18,7 @@ from dlo_calibration.errors import InputError
 from dlo_calibration.model.action import Action, check_grips, Hand, MAXIMUM_TIME
 from dlo_calibration.model.chain import Chain, check_ends, Floats, frozen_array
 
-VIEWS = 25  # goals, evenly spread, from which the places of unseen points of an initial chain are estimated
+VIEWS = 25  # largest number of goals that estimate the places of unseen points of an initial chain
 
 
 @dataclass(frozen=True)
@@ -50,8 +51,8 @@ class Trial:
     """
     One observed manipulation: the DLO before it, the actions of the hands, and the observed goals.
 
-    :param initial: the DLO before the action; point i is the same material point in all chains. Where
-        points of it were not seen, their arc lengths come from the goals that show them.
+    :param initial: the DLO before the action; point i is the same material point in all chains. The arc
+        lengths of its unseen points come from the goals that show them.
     :param actions: one or more, in the order of their start.
     :param goals: one or more, in the order of their time.
     :param velocity: (n, 3) [m/s] of the initial points; None: the DLO is at rest.
@@ -92,7 +93,7 @@ class Trial:
         object.__setattr__(self, 'goals', goals)
         if not self.initial.seen.all():
             places, held = _shown_places(self.initial, goals), self._held_places()
-            object.__setattr__(self, 'initial', self.initial.put_back(places, held))
+            object.__setattr__(self, 'initial', self.initial.interpolated(places, held))
         if self.velocity is not None:
             velocity = frozen_array(self.velocity)
             if velocity.shape != (n, 3) or not np.isfinite(velocity).all():
@@ -120,13 +121,60 @@ class Trial:
         return tuple(sorted({a for each in grips for a, b in zip(each[:-1], each[1:], strict=True)
                              if b == a + 1}))
 
+    def with_shifted_hands(self, shift: Floats) -> Trial:
+        """
+        Return the trial with the hands where they really were, if they are off by `shift`, (3,) [m].
+
+        A hand that grips the nearest place grips where the DLO is nearest to it then.
+        """
+        anew: dict[tuple[str, tuple[int, ...], float], tuple[tuple[int, ...], float]] = {}
+
+        def shifted(hand: Hand) -> Hand:
+            held = hand.name, hand.grips, hand.offset
+            if hand.nearest and held not in anew:
+                chain = [self.initial, *(goal.chain for goal in self.goals if goal.time < hand.start)][-1]
+                point, place, _ = chain.nearest(hand.positions[0] - shift)
+                anew[held] = (point,), place
+            grips, offset = anew.get(held, held[1:])  # a hand that goes on from where it was grips the same
+            return replace(hand, grips=grips, offset=offset, positions=hand.positions - shift)
+
+        actions = tuple(Action(tuple(map(shifted, action.hands))) for action in self.actions)
+        return replace(self, actions=actions)
+
+    def with_late_hands(self, late: float) -> Trial:
+        """
+        Return the trial with the hands when they really moved, if their stamps are late.
+
+        Stable goals still follow the hands, and a hand that holds the DLO from the start still does.
+
+        :param late: [s]; negative: early, by less than the time from any stable goal to the next goal.
+        """
+        goals = self.goals
+        if late > 0 and self.velocity is None:  # the hands have begun before the clock of the trial
+            return replace(self, goals=tuple(replace(goal, time=goal.time + late) for goal in goals))
+        gaps = [after.time - goal.time for goal, after in pairwise(goals) if goal.stable]
+        late = max([late, *(-0.9 * gap for gap in gaps)])
+        if late < 0:
+            goals = tuple(replace(goal, time=goal.time - late) if goal.stable else goal for goal in goals)
+
+        def moved(hand: Hand) -> Hand:
+            times = hand.times - late
+            if not hand.start <= 0 < times[0]:
+                return replace(hand, times=times)
+            rows = [0, *range(len(times))]
+            return replace(hand, times=np.append(0.0, times), positions=hand.positions[rows],
+                           orientations=hand.orientations[rows])
+
+        actions = tuple(Action(tuple(map(moved, action.hands))) for action in self.actions)
+        return replace(self, actions=actions, goals=goals)
+
     def _held_places(self) -> dict[int, Floats]:
         """
-        Return where gripped points were that the initial chain does not show, (3,) [m] by their index.
+        Return the initial positions of gripped points that the initial chain lacks, (3,) [m] by index.
 
-        Goals show them while the hand holds them, as far from the hand as before, unless it turns. Beyond the
-        last point that was seen, the curve through the others would be wrong by a few mm at an end, by which
-        the hand would then move the whole DLO to wrong places.
+        Goals show them while the hand holds them, at the same offset from the hand, unless it turns. At an
+        end, extrapolation of the curve would be wrong by a few mm, and the hand would move the whole DLO by
+        this error.
         """
         places: dict[int, Floats] = {}
         for hand in self.hands:
@@ -155,9 +203,9 @@ class Trial:
 
 def _shown_places(initial: Chain, goals: Sequence[Goal]) -> Floats:
     """
-    Return arc lengths, (n,) [m] from 0, of the points of an initial chain of which some were not seen.
+    Return arc lengths, (n,) [m] from 0, of the points of an initial chain with unseen points.
 
-    A segment that it does not show has its mean length in the goals, or else the mean of all segments.
+    An unseen segment gets its mean length in the goals, or else the mean of all segments.
     """
     few = [goals[k].chain for k in np.linspace(0, len(goals) - 1, min(len(goals), VIEWS)).astype(int)]
     chains = [initial, *few]
@@ -171,5 +219,5 @@ def _shown_places(initial: Chain, goals: Sequence[Goal]) -> Floats:
 
 
 def shown_goals(count: int) -> list[int]:
-    """Return the indices of at most five of `count` goals to show, evenly spread, always with the last."""
+    """Return the indices of at most five of `count` goals to show, evenly spread, with the last."""
     return sorted({int(k) for k in np.linspace(count - 1, 0, min(count, 5)).round()})

@@ -69,7 +69,7 @@ def hanging_parts(points: Floats, level: float | None, margin: float, forces: Se
 
     :param points: (n, 3) [m].
     :param level: height of the centre line where the DLO lies on the table [m]; None: there is no table.
-    :param margin: points less than this above the level may touch the table [m].
+    :param margin: height above the level below which a point may touch the table [m].
     :param forces: points of clamps, which apply a force and a moment; they end a part.
     :param pinned: points that are held, but free to turn.
     :param touching: points that may touch another part of the DLO; parts with such points are left out.
@@ -128,14 +128,14 @@ def balance(points: Floats, places: Floats, part: Part, noise: float) -> Balance
         agrees = abs(fit.load - best.load) < 2 * math.hypot(fit.std, best.std)
         if best.error < 1.5 * noise and agrees:  # the residuals are noise
             break
-        # The errors of the shape in a window that is too long make the load too small.
+        # In a window that is too long, errors of the shape make the load too small.
         best = fit if fit.std < best.std or fit.load > best.load else best
     return best
 
 
 def _fit_windows(observed: Floats, along: Floats, first: str, pins: list[int], windows: int,
                  noise: float) -> Balance | None:
-    """Return the balance of a part in windows; knowledge about its last end is not used."""
+    """Fit the balance to a part in windows; the load at its last end counts as unknown."""
     system = _System(along, first, pins, windows)
     freedom = sum(len(own) for own, _ in system.rows) * 3 - system.count
     if freedom < 6:  # too few measured coordinates beyond the unknowns
@@ -143,7 +143,7 @@ def _fit_windows(observed: Floats, along: Floats, first: str, pins: list[int], w
     shape = bezier_curve(along, observed, system.fine)
     # Only below a free end is the tension known before the fit: it is the weight that hangs there.
     tension = np.array(system.fine) if system.held_at_end else np.zeros(len(shape))
-    for step in range(6):  # alternately of the shape and the moments along it
+    for step in range(6):  # alternately: the moments along the shape, the shape
         matrix, forces = system.columns(shape, tension)
         stretch = np.zeros((1, system.count))
         stretch[0, 1] = _integral(tension, system.fine)[-1] * noise / (0.05 * along[-1])  # prior: 5 % strain
@@ -264,7 +264,6 @@ class PriorEstimate:
 
 UNKNOWN = PriorEstimate()
 
-
 #: A ratio that all chains at rest determine together: estimate, lower and upper bound.
 Ratio = tuple[float, float, float]
 
@@ -288,12 +287,13 @@ def prior_estimates(trials: Sequence[Trial], space: ParameterSpace,
     sigma = 2e-3 if math.isnan(sigma) else max(2e-4, sigma)
     length = float(np.median([trial.initial.length for trial in trials]))
     load, stretch, hold = _resting(trials, table_height, sigma)
-    known = {'friction': _friction(load, hold),
-             'self_collision': _self_collision(trials, table_height, sigma)}
+    estimates = {'friction': _friction(load, hold),
+                 'self_collision': _self_collision(trials, table_height, sigma)}
     if 'mass' not in space.free:  # chains at rest show stiffness only in proportion to weight
         weight = space.physical({}, length)['mass'] / length * GRAVITY
-        known |= {'flexibility': _flexibility(load, hold, weight), 'elasticity': _elasticity(stretch, weight)}
-    return {name: known.get(name, UNKNOWN) for name in space.free}
+        estimates['flexibility'] = _flexibility(load, hold, weight)
+        estimates['elasticity'] = _elasticity(stretch, weight)
+    return {name: estimates.get(name, UNKNOWN) for name in space.free}
 
 
 def start_point(trials: Sequence[Trial], space: ParameterSpace, table_height: float | None) -> Floats:
@@ -336,10 +336,10 @@ def _resting(trials: Sequence[Trial], table_height: float | None, sigma: float
             hands = trial.holding(goal)
             clamps = [grip for hand in hands if len(hand.grips) > 1 for grip in hand.grips]
             pins = [hand.grips[0] for hand in hands if len(hand.grips) == 1]
-            # Points that were not seen tell nothing, but a hand holds the DLO also there.
-            kept = np.flatnonzero(goal.chain.seen | np.isin(np.arange(len(goal.chain)), [*clamps, *pins]))
-            points, along = goal.chain.points[kept], places[kept]
-            clamps, pins = (np.searchsorted(kept, held).tolist() for held in (clamps, pins))
+            # Unseen points give no information, but a hand may hold the DLO there.
+            used = np.flatnonzero(goal.chain.seen | np.isin(np.arange(len(goal.chain)), [*clamps, *pins]))
+            points, along = goal.chain.points[used], places[used]
+            clamps, pins = (np.searchsorted(used, grips).tolist() for grips in (clamps, pins))
             touching = _near_itself(points, along, sigma)
             for part in hanging_parts(points, level, margin, clamps, pins, touching):
                 if fit := balance(points, along, part, sigma):
@@ -422,7 +422,7 @@ def _near_itself(points: Floats, places: Floats, sigma: float) -> list[int]:
 
 
 def _stiffness_bounds(name: str, ratio: Ratio, weight: float) -> tuple[float, float]:
-    """Return the lowest and highest stiffness, from the `_weighted_mean` ratio of weight per length to it."""
+    """Return the lowest and highest stiffness for a weight per length; `ratio` is weight over stiffness."""
     _, low, high = ratio
     return (weight / (high * STIFFNESS_MARGIN) if math.isfinite(high) else BY_NAME[name].at_hundred,
             weight / low * STIFFNESS_MARGIN if low > 0 else BY_NAME[name].at_zero)
@@ -465,8 +465,8 @@ def _self_collision(trials: Sequence[Trial], table_height: float | None, sigma: 
             spacing = float(np.linalg.norm(np.diff(chain.points, axis=0), axis=1).max())
             room = space * 1.2 + SIGMAS * sigma  # a chain cuts corners
             for k in np.flatnonzero(allowed):  # nearer parts cannot touch, see `self_contact`
-                apart = along > np.pi * radii[k] + spacing
-                allowed[k] = not bool((room[apart] < 2 * radii[k]).any())
+                far = along > np.pi * radii[k] + spacing
+                allowed[k] = not bool((room[far] < 2 * radii[k]).any())
     # A larger radius may be allowed though a smaller one is not; the largest allowed one is the bound.
     largest = float(radii[np.flatnonzero(allowed).max(initial=0)])
     levels = [] if table_height is None else [

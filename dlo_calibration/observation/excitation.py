@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Excitation: which parameters a trial can show, judged without simulation."""
+"""Excitation: which parameters a trial can show, found without simulation."""
 
 from __future__ import annotations
 
@@ -132,9 +132,9 @@ def _may_touch_itself(trial: Trial) -> bool:
     steps = np.linspace(0, 1, BETWEEN)[:, None, None]
     between = np.concatenate([a + steps * (b - a) for a, b in zip(chains[:-1], chains[1:], strict=True)])
 
-    def near(distance: Floats, apart: Floats) -> bool:
+    def near(distance: Floats, along: Floats) -> bool:
         # A pair that is further apart than 0.8 of its arc length is not folded back to touch.
-        return bool(((distance < reach + spacing) & (distance < 0.8 * apart)).any())
+        return bool(((distance < reach + spacing) & (distance < 0.8 * along)).any())
 
     for points in between:
         if near(np.linalg.norm(points[:, None] - points[None, :], axis=2), along):
@@ -155,9 +155,9 @@ def _may_stretch(trial: Trial, space: ParameterSpace, sigma: float) -> bool:
     for k, hand in enumerate(hands):
         for other in hands[k + 1:]:
             times = np.linspace(min(hand.start, other.start), max(hand.end, other.end), 4 * BETWEEN)
-            apart = np.linalg.norm(hand.positions_at(times) - other.positions_at(times), axis=1).max()
-            grips = [grip_place(places, grip, one.offset) for one in (hand, other) for grip in one.grips]
-            if apart > 0.9 * np.ptp(grips):  # else the DLO between is slack
+            distance = np.linalg.norm(hand.positions_at(times) - other.positions_at(times), axis=1).max()
+            grips = [grip_place(places, grip, each.offset) for each in (hand, other) for grip in each.grips]
+            if distance > 0.9 * np.ptp(grips):  # else the DLO between is slack
                 return True
     if np.isnan(sigma) or 'mass' in space.free or any(not goal.stable for goal in trial.goals):
         return True

@@ -39,10 +39,10 @@ def noise(trials: Sequence[Trial]) -> float:
                 trial.initial, *(goal.chain for goal in trial.goals if goal.count == 1))]) for trial in some])
             level = np.fmin(along, _noise_over_time(some)) if streamed else along
             levels += [float(level)] * len(some)
-    known = np.array(levels)[np.isfinite(levels)]
-    if not len(known) or (known == known[0]).all():
-        return float(known[0]) if len(known) else float('nan')
-    return float(np.sqrt(np.mean(known**2)))
+    finite = np.array(levels)[np.isfinite(levels)]
+    if not len(finite) or (finite == finite[0]).all():
+        return float(finite[0]) if len(finite) else float('nan')
+    return float(np.sqrt(np.mean(finite**2)))
 
 
 def _views(trial: Trial) -> tuple[Floats, Floats]:
@@ -169,9 +169,9 @@ def smooth(points: Floats, noise: float) -> Floats:
         weights = np.diff(weights, axis=0) / (spread[order:] - spread[:-order])[:, None]
     stiffness, modes = np.linalg.eigh(weights.T @ weights)
     parts = modes.T @ points
-    kept = 1 / (1 + SMOOTHING[:, None] * np.maximum(stiffness, 0))
-    risk = (1 - kept)**2 @ np.sum(parts**2, axis=1) + 2 * 3 * noise**2 * kept.sum(axis=1)
-    return np.asarray(modes @ (kept[np.argmin(risk)][:, None] * parts))
+    gains = 1 / (1 + SMOOTHING[:, None] * np.maximum(stiffness, 0))
+    risk = (1 - gains)**2 @ np.sum(parts**2, axis=1) + 2 * 3 * noise**2 * gains.sum(axis=1)
+    return np.asarray(modes @ (gains[np.argmin(risk)][:, None] * parts))
 
 
 def with_other_noise(trials: Sequence[Trial], noise: float, count: int,
@@ -180,7 +180,8 @@ def with_other_noise(trials: Sequence[Trial], noise: float, count: int,
     Return `count` copies of all trials, whose initial chains have other noise.
 
     New noise is added to the smoothed chains (a parametric bootstrap: Efron and Tibshirani, An
-    Introduction to the Bootstrap, 1993, 6.5), the same to chains that are equal to the digit.
+    Introduction to the Bootstrap, 1993, 6.5), the same to chains that are equal to the digit. Hands that grip
+    the nearest place find it on these chains.
 
     :param noise: standard deviation of one coordinate [m].
     """
@@ -191,7 +192,8 @@ def with_other_noise(trials: Sequence[Trial], noise: float, count: int,
         for trial, points in zip(trials, smoothed, strict=True):
             points = points + generator.normal(0, noise, points.shape)
             chains.setdefault(trial.initial.points.tobytes(), replace(trial.initial, points=points))
-        return tuple(replace(trial, initial=chains[trial.initial.points.tobytes()]) for trial in trials)
+        noisy = (replace(trial, initial=chains[trial.initial.points.tobytes()]) for trial in trials)
+        return tuple(trial.with_shifted_hands(np.zeros(3)) for trial in noisy)
 
     return [drawn() for _ in range(count)]
 

@@ -12,6 +12,7 @@ straight below them (statics of a pivoted body).
 
 from __future__ import annotations
 
+from dataclasses import replace
 import math
 from typing import Iterator, Sequence
 
@@ -21,17 +22,20 @@ from dlo_calibration.errors import InputError
 from dlo_calibration.model.action import Hand
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.parameters import measured, number
-from dlo_calibration.model.trial import shown_goals, Trial
-from dlo_calibration.observation.noise import noise_of
+from dlo_calibration.model.trial import Goal, shown_goals, Trial
+from dlo_calibration.observation.noise import noise, noise_of
 from dlo_calibration.observation.table import HANGING, lowest_level, RESTING_BAND
 
 SHORTEST, LONGEST = 0.02, 15.0  # m; hands manipulate no DLO beyond; half a metre in inches is 20
 UNITS = {'millimetres': 1e-3, 'centimetres': 1e-2, 'inches': 0.0254}
 BELOW = 0.01  # m; a table may be measured with such an error, and trackers see the table through a thin DLO
-SIGMAS = 5.0  # standard deviations of the noise that are never exceeded
-STEEPEST = math.radians(15.0)  # of the plane in which a DLO lies; the pose of a table is known better
+SIGMAS = 5.0  # standard deviations that noise never exceeds
+STEEPEST = math.radians(15.0)  # of the plane in which a DLO lies; table poses are more exact
 BESIDE = math.radians(60.0)  # of a centre of mass from straight below the hands that hold a DLO
 LEVER = 0.1  # of the length; the direction of a shorter lever is uncertain
+NOISY = 0.005  # of the length; trackers and photographs are twice as good
+SUNK = 0.002  # m; a middle line is not further below the top of the table
+LIGHTEST = 200.0  # kg/m^3; cork, and the lightest hoses
 MOST_TRIALS = 3  # with warnings in full; a wrong frame makes all trials wrong
 SOON = 0.5  # s; between two chains with a shorter gap, no DLO turns end for end
 
@@ -39,11 +43,49 @@ SOON = 0.5  # s; between two chains with a shorter gap, no DLO turns end for end
 def implausible_trials(trials: Sequence[Trial], table_height: float | None,
                        scene: bool = False) -> tuple[str, ...]:
     """Return the warnings of `implausible` about the trials of a session; of many trials, the first ones."""
-    warned = [warnings for trial, before in zip(trials, [None, *trials], strict=False)
-              if (warnings := implausible(trial, table_height, scene, before))]
+    warned, before = [], None
+    for trial in trials:
+        if warnings := implausible(trial, table_height, scene, before):
+            warned.append(warnings)
+        before = in_order(trial, before)
     more = len(warned) - MOST_TRIALS
     return (*(text for warnings in warned[:MOST_TRIALS] for text in warnings),
             *[f'{more} more trial(s) are implausible'] * (more > 0))
+
+
+def observation_warnings(trials: Sequence[Trial], table_height: float | None, mass: float = 0.0
+                         ) -> tuple[str, ...]:
+    """
+    Return warnings about how trials were observed: repeated ones, their noise, and the height of the table.
+
+    :param table_height: [m]; None: there is no table.
+    :param mass: of the whole DLO [kg]; 0: unknown.
+    """
+    warnings = list(repeated_trials(trials))
+    length = float(np.mean([trial.initial.length for trial in trials]))
+    sigma = float(np.nan_to_num(noise(trials)))
+    if sigma > NOISY * length:
+        warnings.append(str(InputError(
+            'the chains', f'a noise of {measured(sigma, "m")} in each coordinate', f'at most '
+            f'{measured(NOISY * length, "m")}, {100 * NOISY:g} % of the length',
+            'average several views, light the DLO better, or bring the camera nearer')))
+    flat = max(RESTING_BAND, 6 * sigma)
+    levels = [float(np.median(trial.initial.points[:, 2])) for trial in trials
+              if trial.velocity is None and np.ptp(trial.initial.points[:, 2]) <= flat]
+    if not levels or table_height is None:
+        return tuple(warnings)
+    above, margin = float(np.median(levels)) - table_height, 3 * sigma
+    radius = above - margin
+    if above < -SUNK - margin:
+        warnings.append(str(InputError(
+            'the table', f'a DLO whose middle line lies {measured(-above, "m")} below its top', 'a DLO on it',
+            f'set table_height to about {number(float(np.median(levels)))}, less the radius of the DLO')))
+    elif radius > 0 and 0 < mass < LIGHTEST * math.pi * radius**2 * length:
+        warnings.append(str(InputError(
+            'the table', f'a DLO whose middle line lies {measured(above, "m")} above its top, so that it '
+            f'would be {measured(2 * above, "m")} thick and lighter than foam', 'its radius',
+            'set table_height to the height of the middle line less the radius of the DLO, or correct mass')))
+    return tuple(warnings)
 
 
 def implausible(trial: Trial, table_height: float | None, scene: bool = False,
@@ -53,7 +95,7 @@ def implausible(trial: Trial, table_height: float | None, scene: bool = False,
 
     :param table_height: [m]; None: there is no table.
     :param scene: whether there are other obstacles; a DLO may then lie on them.
-    :param before: the trial before this one in the session.
+    :param before: the trial before this one in the session, see `in_order`.
     """
     length = trial.initial.length
     if not SHORTEST <= length <= LONGEST:
@@ -81,7 +123,7 @@ def _at_rest(trial: Trial) -> list[tuple[str, Chain, Sequence[Hand]]]:
         (f'a DLO at rest at {number(goal.time)} s', goal.chain, trial.holding(goal))
         for goal in shown if goal.stable]
     if trial.velocity is None:
-        # Whether a hand that closes at the start has held the DLO before is not known.
+        # A hand that closes at the start may have held the DLO before.
         chains.append(('a DLO that begins at rest', trial.initial,
                        [hand for hand in trial.hands if hand.times[0] <= 0]))
     return sorted(chains, key=lambda rest: len(rest[2]))
@@ -195,25 +237,102 @@ def _beside(chain: Chain, hands: Sequence[Hand]) -> float:
     return math.acos(float(np.clip(lever @ down / size / np.linalg.norm(down), -1.0, 1.0)))
 
 
+def in_order(trial: Trial, before: Trial | None = None) -> Trial:
+    """
+    Return the trial with a last chain whose points run from the same end as in the trial before.
+
+    If the initial chain is turned, and the first goal too late to tell whether the goals are, too, the last
+    one is not stable: the next trial is not compared with it.
+
+    :param before: itself the outcome of this function; None: it is the first trial.
+    """
+    turned, last = _begins_at_other_end(trial, before), trial.goals[-1]
+    if turned and trial.goals[0].time >= max(0.0, trial.hands[0].start) + SOON:
+        return replace(trial, goals=(*trial.goals[:-1], replace(last, stable=False)))
+    if turned == (_first_turned(trial) is not None):
+        return trial
+    other = Chain(last.chain.points[::-1])
+    return replace(trial, goals=(*trial.goals[:-1], replace(last, chain=other)))
+
+
+def reversed_trials(trials: Sequence[Trial]) -> tuple[bool, ...]:
+    """Return of each trial whether points of a chain run from the other end than in the chain before."""
+    turned, before = [], None
+    for trial in trials:
+        turned.append(_begins_at_other_end(trial, before) or _first_turned(trial) is not None)
+        before = in_order(trial, before)
+    return tuple(turned)
+
+
+def repeated(trial: Trial, others: Sequence[Trial]) -> tuple[str, ...]:
+    """
+    Return a warning if a trial repeats one of the others bit for bit, as no measurement does.
+
+    The means of chains at rest are not compared: a stream may still add to them.
+    """
+    for other in others:
+        if _repeats(trial, other):
+            return str(InputError(
+                trial.name, f'the initial chain, hands and goal chains of {other.name}, bit for bit',
+                'measurements of its own', 'leave one of them out: together they count twice, and all '
+                'intervals become too narrow')),
+    return ()
+
+
+def repeated_trials(trials: Sequence[Trial]) -> tuple[str, ...]:
+    """Return the warnings of `repeated` about the trials of a session; of many trials, the first ones."""
+    warnings = [text for k, trial in enumerate(trials) for text in repeated(trial, trials[:k])]
+    more = len(warnings) - MOST_TRIALS
+    return (*warnings[:MOST_TRIALS], *[f'{more} more trial(s) are repeated'] * (more > 0))
+
+
+def _repeats(trial: Trial, other: Trial) -> bool:
+    pairs = [(trial.initial.observed, other.initial.observed)]
+    if len(trial.hands) != len(other.hands):
+        return False
+    for hand, its in zip(trial.hands, other.hands, strict=True):
+        pairs += [(hand.times, its.times), (hand.positions, its.positions)]
+    goals, its_goals = ([goal for goal in each.goals if goal.count == 1] for each in (trial, other))
+    if not goals or not its_goals:
+        goals, its_goals = list(trial.goals), list(other.goals)
+    pairs += [(goal.chain.observed, its.chain.observed)
+              for goal, its in zip(goals, its_goals, strict=False)]
+    return all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
+
+
 def _swapped(trial: Trial, before: Trial | None) -> Iterator[str]:
-    """Yield warnings about chains whose points run from the other end than in the chain before."""
-    length, initial = trial.initial.length, trial.initial.points
+    """Yield a warning if the points of a chain run from the other end than in the chain before."""
     remedy = 'number the points from the same end of the DLO in all chains'
-    if before is not None and len(before.initial) == len(initial) and before.goals[-1].stable:
-        last = before.goals[-1].chain.points
-        if _reversed_fits(last, initial, length) and _apart(last[::-1], initial) < 0.03 * length:
-            yield str(InputError(trial.name, f'an initial chain that is the last one of {before.name} from '
-                                 'the other end', 'the same end first', remedy))
-    chains, times = [initial], [-math.inf]
-    for goal in trial.goals:
+    if before is not None and _begins_at_other_end(trial, before):
+        yield str(InputError(trial.name, f'an initial chain that is the last one of {before.name} from '
+                             'the other end', 'the same end first', remedy))
+    elif (goal := _first_turned(trial)) is not None:
+        yield str(InputError(trial.name, f'a goal chain at {number(goal.time)} s whose points run from '
+                             'the other end of the DLO', 'the end that was first before', remedy))
+
+
+def _begins_at_other_end(trial: Trial, before: Trial | None) -> bool:
+    """Return whether the initial chain is the last one of the trial before from the other end."""
+    if before is None or len(before.initial) != len(trial.initial) or not before.goals[-1].stable:
+        return False
+    last, initial, length = before.goals[-1].chain.points, trial.initial.points, trial.initial.length
+    return _reversed_fits(last, initial, length) and _apart(last[::-1], initial) < 0.03 * length
+
+
+def _first_turned(trial: Trial) -> Goal | None:
+    """Return the first goal whose points run from the other end than in the chain before, if there is one."""
+    length = trial.initial.length
+    chains = np.stack([trial.initial.points, *(goal.chain.points for goal in trial.goals)])
+    # A DLO at rest stays there until a hand closes.
+    begin = 0.0 if trial.velocity is not None else max(0.0, trial.hands[0].start)
+    soon = np.diff([begin, *(goal.time for goal in trial.goals)]) < SOON
+    jumps = soon & (np.linalg.norm(np.diff(chains, axis=0), axis=2).mean(axis=1) > 0.1 * length)
+    for goal, jump, before in zip(trial.goals, jumps, chains, strict=False):
         points = goal.chain.points
-        soon = goal.time - times[-1] < SOON and _reversed_fits(chains[-1], points, length)
-        if soon or goal.stable and _held_at_other_end(trial, goal.time, points, length):
-            yield str(InputError(trial.name, f'a goal chain at {number(goal.time)} s whose points run from '
-                                 'the other end of the DLO', 'the end that was first before', remedy))
-            return
-        chains.append(points)
-        times.append(goal.time)
+        if jump and _reversed_fits(before, points, length) \
+                or goal.stable and _held_at_other_end(trial, goal.time, points, length):
+            return goal
+    return None
 
 
 def _apart(points: Floats, other: Floats) -> float:

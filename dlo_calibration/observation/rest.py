@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Rest: when a DLO comes to rest after an action, where, and until when, as a tracker shows it."""
+"""Rest: when and where a DLO rests after an action, as a tracker shows it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from dlo_calibration.model.chain import Chain, Floats
 
 OPENING = 0.1  # s after the last waypoint; until then a hand may not have opened, though the DLO lies still
-STILL = 1.0  # s without motion: longer than a hand takes to open, and than a swing is at its turning point
+STILL = 1.0  # s without motion: longer than a hand takes to open, or a swing to turn
 STREAM = 12  # chains that make a stream: a goal is a block of it at rest, and noise shows over time, too
 BLOCK = 4  # chains that a block has at least
 AGREE = 3.0  # stable distances between blocks at rest; trackers and tables are less still than a simulation
@@ -56,7 +56,7 @@ class Stream:
         self._time, self._distance, self._limit = time, distance, limit
         self._open: list[tuple[int, float, Floats]] = []  # index, instant [s], points of each chain
         self._repeated = 0  # chains among those that repeat the one before
-        self._blocks: list[_Block] = []  # until it is certain at which of them rest begins
+        self._blocks: list[_Block] = []  # until it is certain where rest begins
         self._place: _Place | None = None
 
     def add(self, instant: float, chain: Chain) -> None:
@@ -151,8 +151,8 @@ class _Block:
 def _mean_square(differences: Floats) -> float:
     """Return the mean square length of (n, 3) differences without those that are NaN; nan if all are."""
     squares = np.sum(differences**2, axis=1)
-    known = squares[np.isfinite(squares)]
-    return float(known.mean()) if len(known) else float('nan')
+    finite = squares[np.isfinite(squares)]
+    return float(finite.mean()) if len(finite) else float('nan')
 
 
 class _Place:

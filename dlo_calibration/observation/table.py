@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.trial import Trial
 
-HANGING = 0.04  # m; a DLO whose lowest points are so much above the table hangs
+HANGING = 0.04  # m; a DLO whose lowest points are higher above the table hangs
 RESTING_BAND = 0.006  # m; points of a resting chain are at most this much above its lowest one
-STACKED = 0.0015  # m; the higher of two strands that cross lies on the other if it is so much higher
+STACKED = 0.0015  # m; of two strands that cross, one that is higher by this lies on the other
 RISEN = 0.25  # share of its height above the other strand above which a point of the upper strand is raised
 
 

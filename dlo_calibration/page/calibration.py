@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The calibration of a project's trials, as the page shows it: its progress, and its result."""
+"""The calibration of a project's trials, as the page shows it: its progress and its result."""
 
 from __future__ import annotations
 
-from contextlib import ExitStack, suppress
+from contextlib import closing, ExitStack, suppress
 from dataclasses import dataclass
 import json
 from pathlib import Path
@@ -23,22 +23,22 @@ from dlo_calibration.files.result import Description, read_result
 from dlo_calibration.report.sentences import sentences
 from dlo_calibration.workspace.folder import CalibrationFolder, FILES, RESULT
 from dlo_calibration.workspace.source import read_source, Selection
-from dlo_calibration.workspace.worker import Failure, Notice, Progress, Worker
+from dlo_calibration.workspace.worker import CalibrationWarning, Failure, Progress, Worker
 from dlo_calibration.writing import reason, write_file
 
-SHOWN = 'result.json'  # what the page shows
-LONGEST = 2**22  # bytes of what the page shows; a stranger's must not take all memory
-PATIENCE = 5.0  # s that whoever ends the page waits at most
+PAGE_RESULT = 'result.json'  # file with the result that the page shows
+LONGEST = 2**22  # bytes of that file; a stranger's must not take all memory
+PATIENCE = 5.0  # s, for which the end of the page waits at most
 IDLE, CALIBRATING, DONE, FAILED, STOPPED = 'idle', 'calibrating', 'done', 'failed', 'stopped'
 
 
 @dataclass(frozen=True)
-class Shown:
+class PageResult:
     """
     A result as the page shows it.
 
     :param digest: of the trials that were calibrated.
-    :param values: as `fit --json` prints it, with `sentences`.
+    :param values: as `fit --json` prints them, with `sentences`.
     """
 
     digest: str
@@ -56,8 +56,8 @@ class ProjectCalibration:
     def __init__(self, project: Path, make_simulator: SimulatorFactory, options: Mapping[str, Any]) -> None:
         self.folder = project / CALIBRATION
         self.state, self.text = IDLE, ''
-        self.shown: Shown | None = None
-        self.description: Description | None = None  # the same result, to be simulated
+        self.result: PageResult | None = None
+        self.description: Description | None = None  # the same result, to simulate it
         self.files: tuple[str, ...] = ()  # of that result, in the folder
         self._make_simulator = make_simulator
         self._machine = {name: value for name, value in options.items() if name in names_of(MACHINE)}
@@ -68,7 +68,7 @@ class ProjectCalibration:
         self._warnings: list[str] = []
         self._digest = ''
         self._writing: threading.Thread | None = None
-        self.written = threading.Event()  # files of a result, since somebody cleared it
+        self.written = threading.Event()  # set once the files of a result are written
         self._ending = threading.Event()
         self._reopen()
 
@@ -83,17 +83,17 @@ class ProjectCalibration:
 
         :param session: the MCAP file with the trials and the options.
         :param digest: of the trials, which shows whether they change afterwards.
-        :raises InputError: if it is under way already, or the session cannot be used.
+        :raises InputError: if another one is under way, or the session cannot be used.
         """
         if self.busy or (self._writing is not None and self._writing.is_alive()):
             raise InputError('calibration', 'another one', 'one at a time',
-                             'stop the one that is under way, or wait until its files are written')
+                             'stop the other one, or wait until its files are written')
         warnings: list[str] = []
         source = read_source(Selection(session, self._machine), warnings.append).require_trials()
         with ExitStack() as stack:
-            folder = stack.enter_context(CalibrationFolder(self.folder))
+            folder = stack.enter_context(closing(CalibrationFolder(self.folder)))
             folder.begin(source, warnings.append, instead=True)
-            stack.pop_all()  # it stays open until the calibration has ended
+            stack.pop_all()  # the folder stays open until the calibration has ended
         self._calibration, self._options = folder, source.options
         self._warnings, self._digest = warnings, digest
         chosen = choose(source.trials, source.options).options
@@ -112,7 +112,7 @@ class ProjectCalibration:
             news = True
             if isinstance(event, Evaluation):
                 self._progress.take(event)
-            elif isinstance(event, Notice):
+            elif isinstance(event, CalibrationWarning):
                 self._warnings.append(event.text)
             elif isinstance(event, Failure):
                 self._fail(event)
@@ -122,25 +122,25 @@ class ProjectCalibration:
 
     def plain(self, digest: str) -> dict[str, Any]:
         """
-        Return what the page shows of the calibration, without the result.
+        Return the state of the calibration as the page shows it, without the result.
 
         :param digest: of the trials as they are now.
         """
         progress, best = self._progress, None
         if progress.best is not None:
             best = {'score': progress.best.score, 'parameters': dict(progress.best.values)}
-        left = progress.seconds_left if self.busy and progress.count else None
+        seconds_left = progress.seconds_left if self.busy and progress.count else None
         return {'state': self.state, 'evaluations': progress.count, 'of': progress.evaluations,
-                'seconds_left': left, 'best': best,
+                'seconds_left': seconds_left, 'best': best,
                 'text': self.text or None, 'warnings': list(dict.fromkeys(self._warnings)),
-                'outdated': self.shown is not None and self.shown.digest != digest,
+                'outdated': self.result is not None and self.result.digest != digest,
                 'files': list(self.files)}
 
     def plain_result(self, digest: str) -> dict[str, Any] | None:
         """Return the result as the page shows it; None: there is none."""
-        if self.shown is None:
+        if self.result is None:
             return None
-        return {**self.shown.values, 'outdated': self.shown.digest != digest}
+        return {**self.result.values, 'outdated': self.result.digest != digest}
 
     def close(self) -> None:
         """End the calibration; its log stays, so that it can be resumed."""
@@ -168,23 +168,23 @@ class ProjectCalibration:
         words = [result.choice.words] if result.choice and result.choice.words else []
         values = with_nulls({**plain(result), 'sentences': [*words, *sentences(result)]})
         assert self._calibration is not None
-        self.shown, self.files = Shown(self._digest, values), ()
+        self.result, self.files = PageResult(self._digest, values), ()
         self.description = Description.of(result, self._options.flat())
         self.state = STOPPED if stopped else DONE
         self._writing = threading.Thread(
-            target=self._write, args=(self._calibration, result, self.shown, self.state), name='result',
+            target=self._write, args=(self._calibration, result, self.result, self.state), name='result',
             daemon=True)
         self._writing.start()
 
-    def _write(self, calibration: CalibrationFolder, result: CalibrationResult, shown: Shown, state: str
+    def _write(self, calibration: CalibrationFolder, result: CalibrationResult, page: PageResult, state: str
                ) -> None:
         try:
-            with calibration:
-                text = json.dumps({'digest': shown.digest, 'state': state, 'result': shown.values},
+            with closing(calibration):
+                text = json.dumps({'digest': page.digest, 'state': state, 'result': page.values},
                                   allow_nan=False)
-                write_file(self.folder / SHOWN, text)
+                write_file(self.folder / PAGE_RESULT, text)
                 attempts = calibration.complete(result, self._make_simulator, self._ending.is_set,
-                                                stopped=state == STOPPED)
+                                                stopped=state == STOPPED, responsive=True)
                 self.files = tuple(name for name in FILES if name in attempts.written)
                 if attempts.failure:
                     self._warnings.append(f'could not be written: {attempts.failure}')
@@ -194,16 +194,16 @@ class ProjectCalibration:
 
     def _reopen(self) -> None:
         """Show the result of an earlier session of the page."""
-        # It does not exist, or it is a stranger's.
+        # The file does not exist, or is a stranger's.
         with suppress(OSError, ValueError, RecursionError, KeyError, TypeError, DloCalibrationError):
-            path = self.folder / SHOWN
+            path = self.folder / PAGE_RESULT
             if not _is_ours(path) or path.stat().st_size > LONGEST:
                 return
             content = json.loads(path.read_text(encoding='utf-8'))
             values = content['result']
             if not isinstance(values, dict) or not isinstance(values['parameters'], dict):
                 return
-            self.shown = Shown(str(content['digest']), values)
+            self.result = PageResult(str(content['digest']), values)
             self.state = STOPPED if content['state'] == STOPPED else DONE
             description = read_result(self.folder / RESULT)
             if description.score == values['score']:  # else the process was killed before it wrote this file

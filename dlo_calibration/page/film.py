@@ -21,13 +21,13 @@ from dlo_calibration.vision.scale import Scale
 PAUSE = 0.5  # s in the film between the last simulated instant and the DLO at rest
 
 
-def filmed(trial: Trial, description: Description, make_simulator: SimulatorFactory) -> Motion:
+def film_motion(trial: Trial, description: Description, make_simulator: SimulatorFactory) -> Motion:
     """
     Simulate a trial with the parameters of a result; the last chain is compared with the goal.
 
     :raises DloCalibrationError: if it cannot be simulated.
     """
-    options = Options.of(description.options)
+    options = Options.of(description.file_options.values)
     with closing(make_simulator(options)) as simulator:
         motion = simulated_motion(trial, simulator, description.physical())
     return Motion(np.append(motion.times, motion.times[-1] + PAUSE),
@@ -39,7 +39,7 @@ def film(trial: Trial, motion: Motion, scale: Scale) -> dict[str, Any]:
     Return a motion as the page shows it over a photograph.
 
     :returns: `times` [s]; `pixels`: of the chain, at each time; `goal`: index of the time that is compared
-        with the goal; `names`: of the hands; `hands`: where each of them holds the DLO [px], at each time.
+        with the goal; `names`: of the hands; `hands`: the pixel at which each holds the DLO, at each time.
     """
     names = list(dict.fromkeys(hand.name for hand in trial.hands))
     shown = scale.to_pixels(motion.chains.reshape(-1, 3)).reshape(*motion.chains.shape[:2], 2)
@@ -49,7 +49,7 @@ def film(trial: Trial, motion: Motion, scale: Scale) -> dict[str, Any]:
 
 
 def _holding(trial: Trial, names: list[str], time: float, scale: Scale) -> list[list[float] | None]:
-    """Return the pixel of each hand that holds the DLO at a time; None for another one."""
+    """Return the pixel of each hand that holds the DLO at a time; None for each other hand."""
     following = next((goal for goal in trial.goals if goal.time >= time), trial.goals[-1])
     holding = {hand.name: hand for hand in trial.holding(
         Goal(trial.initial, time, stable=False, held_by=following.held_by))}
@@ -58,5 +58,5 @@ def _holding(trial: Trial, names: list[str], time: float, scale: Scale) -> list[
 
 
 def _rounded(pixels: Floats) -> Any:
-    """Return pixels as lists, rounded to a tenth, which is all that a screen shows."""
+    """Return pixels as lists, rounded to a tenth: a screen shows no more."""
     return np.round(pixels, 1).tolist()

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The ROS graph, as far as the page needs it; the room `ros`, which comes later, implements it."""
+"""The ROS graph, as far as the page needs it; the room `ros` implements it."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class PageGraph(Protocol):
         """
         Return the newest image of a topic.
 
-        :raises InputError: if none comes.
+        :raises InputError: if none arrives.
         """
 
     def send(self, trials: Sequence[Trial], namespace: str) -> str:

@@ -14,21 +14,21 @@ from aiohttp import web
 from aiohttp.http import HttpProcessingError
 
 from dlo_calibration.errors import DEFECT, DloCalibrationError, safe_line
-from dlo_calibration.page.studio import NotThere
+from dlo_calibration.page.studio import UnknownName
 
 LOG = logging.getLogger('dlo_calibration')
-#: The log of aiohttp's server, which would write a traceback for every broken request.
+#: The log of aiohttp's server, without the tracebacks that it writes for broken requests.
 HTTP_LOG = logging.getLogger('dlo_calibration.http')
-#: What is raised for a request that is no HTTP, is damaged, or whose connection ends too early.
+#: Exceptions for a request that is no HTTP, is damaged, or whose connection ends too early.
 BROKEN = (HttpProcessingError, web.RequestPayloadError, ConnectionError)
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
-#: What the page may load and reach: only its own server.
+#: The page may load and reach only its own server.
 POLICY = ("default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
           "connect-src 'self'; media-src 'self' blob:; base-uri 'none'; form-action 'none'; "
           "frame-ancestors 'none'")
-#: The report is a page of its own, which needs nothing of this server: it is an origin of its own.
+#: The report needs nothing of this server: it gets an origin of its own.
 REPORT_POLICY = ("sandbox allow-popups; default-src 'none'; style-src 'unsafe-inline'; img-src data:; "
                  "base-uri 'none'; form-action 'none'; frame-ancestors 'none'")
 HEADERS = {
@@ -44,17 +44,6 @@ NOT_FOUND = 'there is nothing at this address; open the one that dlo-calibration
 
 HTTP_LOG.addFilter(lambda record: not (record.exc_info and isinstance(record.exc_info[1], BROKEN)))
 
-
-class Refused(DloCalibrationError):
-    """
-    A request that is refused.
-
-    :param status: of HTTP.
-    """
-
-    def __init__(self, status: int, text: str) -> None:
-        super().__init__(text)
-        self.status = status
 
 
 class Guard:
@@ -77,10 +66,8 @@ class Guard:
             answer = await handler(request)
         except web.HTTPException as error:
             answer = refusal(error.status, NOT_FOUND if error.status == 404 else error.reason)
-        except Refused as error:
-            answer = refusal(error.status, str(error))
         except DloCalibrationError as error:
-            answer = refusal(404 if isinstance(error, NotThere) else 400, str(error))
+            answer = refusal(404 if isinstance(error, UnknownName) else 400, str(error))
         except Exception as error:  # a defect must not look like a lost connection
             LOG.exception('request %s', request.path.rpartition('/')[2])
             answer = refusal(500, f'{type(error).__name__}: {error}; {DEFECT}')
@@ -91,23 +78,24 @@ class Guard:
     def _check(self, request: web.Request) -> None:
         host = request.headers.get('Host', '')
         if not self._is_ours(host):
-            raise Refused(403, 'the address of this page has another host; open the one that was printed')
+            raise web.HTTPForbidden(
+                reason='the address of this page has another host; open the one that was printed')
         token = request.path.lstrip('/').partition('/')[0].encode('utf-8', 'surrogatepass')
         if not hmac.compare_digest(token, self._token):
-            raise Refused(404, NOT_FOUND)
+            raise web.HTTPNotFound
         origin = request.headers.get('Origin')
         site = request.headers.get('Sec-Fetch-Site', 'none')
         if (origin is not None and origin != f'http://{host}') or site not in ('none', 'same-origin'):
-            raise Refused(403, 'another page asked for this; only the page of this server may')
+            raise web.HTTPForbidden(reason='another page asked for this; only the page of this server may')
 
     def _is_ours(self, host: str) -> bool:
-        """Tell whether the host of a request is the one that the server listens on."""
+        """Tell whether the host of a request is that of the server."""
         name, _, port = host.lower().rpartition(':')
         if port != str(self.port):
             return False
         if name in LOOPBACK or name.strip('[]') == self._host.lower():
             return True
-        try:  # where it listens on every address of this machine, no name is accepted: DNS could rebind it
+        try:  # a server on all addresses of this machine accepts no name: DNS could rebind it
             ipaddress.ip_address(name.strip('[]'))
             return ipaddress.ip_address(self._host).is_unspecified
         except ValueError:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Information of each trial before anything is calibrated, computed while the person works."""
+"""Information of each trial before a calibration, computed while the person works."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class Information:
     def __init__(self, make_simulator: SimulatorFactory) -> None:
         self._appraiser = LiveInformation(make_simulator)
         self._wanted: tuple[tuple[Trial, ...], Options] = ((), Options())
-        self._appraised: tuple[object, ...] = ()  # what the last appraisal was started for
+        self._appraised: tuple[object, ...] = ()  # key of the last appraisal
         self._changed = time.monotonic()
-        self._found: dict[str, dict[str, Any]] = {}  # by the name of the trial
+        self._entries: dict[str, dict[str, Any]] = {}  # by the name of the trial
 
     def want(self, trials: Sequence[Trial], options: Options) -> None:
         """Set the trials to appraise; each has a name of its own."""
@@ -37,34 +37,34 @@ class Information:
             self._wanted, self._changed = (tuple(trials), options), time.monotonic()
 
     def pause(self) -> None:
-        """Stop the appraisal, as a calibration needs the processor; `take` starts it again."""
+        """Stop the appraisal, to leave the processor to a calibration; `take` starts it again."""
         if self._appraiser.alive:
             self._appraiser.stop()
             self._appraised = ()
 
     def take(self) -> bool:
-        """Begin to appraise new trials; return whether one has been appraised since the last call."""
+        """Begin to appraise new trials; return whether information has arrived since the last call."""
         key = _key(*self._wanted)
         if key != self._appraised and time.monotonic() - self._changed > QUIET:
-            if key[:len(self._appraised)] != self._appraised:  # not only new trials after the others
+            if key[:len(self._appraised)] != self._appraised:  # more than new trials at the end
                 self._appraiser.stop()
-                self._found, self._appraised = {}, ()
+                self._entries, self._appraised = {}, ()
             if self._appraiser.join(0.0):
                 self._appraiser.start(*self._wanted)
                 self._appraised = key
         news = False
         for information in self._appraiser.waiting_information():
-            values = None if information.problem else {
+            values = None if information.failure else {
                 name: {'before': float(before) * SCALE, 'after': float(after) * SCALE}
                 for name, before, after in zip(
                     information.names, information.before, information.after, strict=True)}
-            self._found[information.trial] = {'parameters': values, 'sentence': information.words}
+            self._entries[information.trial] = {'parameters': values, 'sentence': information.words}
             news = True
         return news
 
     def plain(self, name: str) -> dict[str, Any] | None:
         """Return the information of a trial as the page shows it; None: it is not known yet."""
-        return self._found.get(name)
+        return self._entries.get(name)
 
     def close(self) -> None:
         """End the simulations."""

@@ -22,7 +22,7 @@ from dlo_calibration.calibration.result import with_nulls
 from dlo_calibration.capture.json_values import parsed
 from dlo_calibration.capture.project import OldRevision
 from dlo_calibration.errors import InputError
-from dlo_calibration.page.guard import BROKEN, Guard, HTTP_LOG, LOG, protect, Refused, REPORT_POLICY
+from dlo_calibration.page.guard import BROKEN, Guard, HTTP_LOG, LOG, protect, REPORT_POLICY
 from dlo_calibration.page.studio import Studio
 from dlo_calibration.vision.board import board_document
 
@@ -35,8 +35,8 @@ LARGEST_TEXT = 2 * 2**20  # bytes of anything else
 TICK = 0.2  # s between two checks of the background work
 PAUSE = 5.0  # s after a check that failed
 NAME_LENGTH = 255
-ELSEWHERE = '192.0.2.1', 9  # an address that no machine has (RFC 5737), routed as those of others are
-MOST_PAGES = 20  # that can listen at the same time
+ELSEWHERE = '192.0.2.1', 9  # an address that no machine has (RFC 5737), routed like those of other machines
+MOST_PAGES = 20  # that listen at the same time
 SILENCE = 15.0  # s, after which a comment keeps the connection alive
 
 
@@ -45,8 +45,8 @@ def serve(studio: Studio, *, host: str = '127.0.0.1', port: int = 0, ready: Call
     """
     Serve the page of a studio until `should_stop` returns true, and close the studio.
 
-    :param port: 0: one that is free.
-    :param ready: called with the address of the page, when it can be opened.
+    :param port: 0: any free one.
+    :param ready: called with the address of the page, once it can be opened.
     :raises InputError: if the server cannot listen there.
     """
     try:
@@ -68,7 +68,7 @@ async def _serve(studio: Studio, host: str, port: int, ready: Callable[[str], No
             await site.start()
         except (OSError, OverflowError) as error:
             raise InputError(f'address {host} port {port}', getattr(error, 'strerror', None) or str(error),
-                             'one that is free on this machine', 'choose another --port') from error
+                             'a free one on this machine', 'choose another --port') from error
         guard.port = runner.addresses[0][1]
         ready(f'http://{_named(host)}:{guard.port}/{token}/')
         while not should_stop():
@@ -80,7 +80,7 @@ async def _serve(studio: Studio, host: str, port: int, ready: Callable[[str], No
 
 
 def _named(host: str) -> str:
-    """Return a host as it is written in an address; for all interfaces, the address that others reach."""
+    """Return a host as written in an address; for all interfaces, the address that other machines reach."""
     if host in ('0.0.0.0', '::'):
         with suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             probe.connect(ELSEWHERE)  # sends nothing
@@ -90,7 +90,7 @@ def _named(host: str) -> str:
 
 
 async def _publish(studio: Studio, events: Events) -> None:
-    """Send what happened in the background to the open pages."""
+    """Send the news of the background work to the open pages."""
     try:
         for name in await asyncio.to_thread(studio.tick):
             events.publish(name, await asyncio.to_thread(getattr(studio, name)))
@@ -120,7 +120,7 @@ def application(studio: Studio, events: Events, guard: Guard, token: str) -> web
 
 
 class Routes:
-    """Answers requests; whatever takes time runs in a thread."""
+    """Answers requests; slow work runs in a thread."""
 
     def __init__(self, studio: Studio, events: Events) -> None:
         self._studio, self._events = studio, events
@@ -135,7 +135,7 @@ class Routes:
                             charset='utf-8' if TYPES[file.suffix].startswith('text/') else None)
 
     async def state(self, request: web.Request) -> web.StreamResponse:
-        """Give all that the page draws."""
+        """Give everything that the page draws."""
         return await self._answer(self._studio.state)
 
     async def change(self, request: web.Request) -> web.StreamResponse:
@@ -154,10 +154,10 @@ class Routes:
         return await self._changed(partial(self._studio.add_photograph, octets, _name(request)))
 
     async def picture(self, request: web.Request) -> web.StreamResponse:
-        """Give a photograph as a JPEG of any width."""
+        """Give a photograph as a JPEG, of any width."""
         width = request.query.get('width')
         if width is not None and not re.fullmatch('[0-9]{1,5}', width):
-            raise Refused(400, 'the width of a picture is a number of pixels')
+            raise web.HTTPBadRequest(reason='the width of a picture is a number of pixels')
         octets = await asyncio.to_thread(self._studio.picture, request.match_info['id'],
                                          int(width) if width else None)
         return web.Response(body=octets, content_type='image/jpeg',
@@ -173,12 +173,12 @@ class Routes:
         return await self._changed(self._studio.remove_lens)
 
     async def board(self, request: web.Request) -> web.StreamResponse:
-        """Give the board to be printed."""
+        """Give the document of the board."""
         paper = request.match_info['paper']
         if paper not in ('a4', 'letter'):
             raise web.HTTPNotFound
         return web.Response(body=await asyncio.to_thread(board_document, paper),
-                            content_type='application/pdf', headers=_saved(f'board_{paper}.pdf'))
+                            content_type='application/pdf', headers=_attachment(f'board_{paper}.pdf'))
 
     async def calibrate(self, request: web.Request) -> web.StreamResponse:
         """Begin to calibrate."""
@@ -197,14 +197,14 @@ class Routes:
         return await self._answer(partial(self._studio.film, int(number), identity))
 
     async def file(self, request: web.Request) -> web.StreamResponse:
-        """Give a file to save, or the report to be read."""
+        """Give a file to save, or the report to read."""
         name = request.match_info['name']
         octets = await asyncio.to_thread(self._studio.file, name)
         kind = TYPES[Path(name).suffix]
         if name.endswith('.html'):
             return web.Response(body=octets, content_type=kind, charset='utf-8',
                                 headers={'Content-Security-Policy': REPORT_POLICY})
-        return web.Response(body=octets, content_type=kind, headers=_saved(name))
+        return web.Response(body=octets, content_type=kind, headers=_attachment(name))
 
     async def topics(self, request: web.Request) -> web.StreamResponse:
         """Give the ROS topics with images."""
@@ -220,8 +220,8 @@ class Routes:
         namespace = _word(await _object(request), 'namespace')
         return _json({'text': await asyncio.to_thread(self._studio.send, namespace)})
 
-    async def _answer(self, what: Callable[[], Any]) -> web.StreamResponse:
-        return _json(await asyncio.to_thread(what))
+    async def _answer(self, value: Callable[[], Any]) -> web.StreamResponse:
+        return _json(await asyncio.to_thread(value))
 
     async def _changed(self, act: Callable[[], dict[str, Any]]) -> web.StreamResponse:
         """Change the project in a thread, send the new state to all open pages, and answer with it."""
@@ -232,41 +232,45 @@ class Routes:
 
 async def _octets(request: web.Request, most: int) -> bytes:
     """Return the content of a request; refuse a large one before it is all in memory."""
-    refused = Refused(413, f'what was sent has more than {most / 1e6:.0f} MB; send a smaller file')
-    if (request.content_length or 0) > most:
-        raise refused
+    def check(count: int) -> None:
+        if count > most:
+            raise web.HTTPRequestEntityTooLarge(
+                most, count, reason=f'the content has more than {most / 1e6:.0f} MB; send a smaller file')
+
+    check(request.content_length or 0)
     pieces, count = [], 0
     try:
         async for piece in request.content.iter_any():
             pieces.append(piece)
             count += len(piece)
-            if count > most:
-                raise refused
+            check(count)
     except BROKEN as error:
-        raise Refused(400, 'what was sent is damaged, or ended too early; send it again') from error
+        raise web.HTTPBadRequest(
+            reason='the content is damaged, or ended too early; send it again') from error
     return b''.join(pieces)
 
 
 async def _object(request: web.Request) -> dict[str, Any]:
-    """Return the JSON object that was sent; an empty one where nothing was."""
+    """Return the JSON object in a request; an empty one for an empty request."""
     octets = await _octets(request, LARGEST_TEXT)
     if not octets:
         return {}
     if request.content_type != 'application/json':
-        raise Refused(415, 'what was sent is no JSON; send it as application/json')
+        raise web.HTTPUnsupportedMediaType(reason='the content is no JSON; send it as application/json')
     try:
         value = parsed(octets)
     except (ValueError, RecursionError) as error:
-        raise Refused(400, 'what was sent is no JSON that can be read; load the page again') from error
+        raise web.HTTPBadRequest(reason='the content is damaged JSON; load the page again') from error
     if not isinstance(value, dict):
-        raise Refused(400, 'what was sent is no JSON object; load the page again')
+        raise web.HTTPBadRequest(reason='the content is no JSON object; load the page again')
     return value
 
 
 def _word(given: dict[str, Any], name: str) -> str:
     value = given.get(name)
     if not isinstance(value, str) or not 0 < len(value) <= NAME_LENGTH:
-        raise Refused(400, f'{name} is missing, or is no text of at most {NAME_LENGTH} characters')
+        raise web.HTTPBadRequest(
+            reason=f'{name} is missing, or is no text of at most {NAME_LENGTH} characters')
     return value
 
 
@@ -275,7 +279,7 @@ def _name(request: web.Request) -> str:
     return unquote(request.headers.get('X-Name', ''), errors='replace')[:NAME_LENGTH]
 
 
-def _saved(name: str) -> dict[str, str]:
+def _attachment(name: str) -> dict[str, str]:
     """Return the header of a file that the browser saves."""
     return {'Content-Disposition': f'attachment; filename="{name}"'}
 
@@ -289,7 +293,7 @@ class Events:
     """The events for the open pages; a slow page gets only the newest event of each name."""
 
     def __init__(self) -> None:
-        self._waiting: dict[int, dict[str, bytes]] = {}  # by page: the newest event of each name
+        self._waiting: dict[int, dict[str, bytes]] = {}  # page -> name -> the newest event
         self._news: dict[int, asyncio.Event] = {}
         self._closed = False
 
@@ -311,7 +315,7 @@ class Events:
     async def answer(self, request: web.Request) -> web.StreamResponse:
         """Answer a page that listens, until it is closed."""
         if len(self._waiting) >= MOST_PAGES:
-            raise Refused(409, f'{MOST_PAGES} pages are open already; close some')
+            raise web.HTTPConflict(reason=f'{MOST_PAGES} pages are open already; close some')
         page = id(request)
         waiting, news = self._waiting.setdefault(page, {}), self._news.setdefault(page, asyncio.Event())
         answer = web.StreamResponse(headers={'Content-Type': 'text/event-stream'})

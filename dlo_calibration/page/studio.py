@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Studio: everything that the page can ask for, without HTTP."""
+"""Studio: the answers to all requests of the page, without HTTP."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from dlo_calibration.evaluation.digest import digest
 from dlo_calibration.files.chain_file import chain_csv, chain_xml
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.page.calibration import ProjectCalibration
-from dlo_calibration.page.film import film, filmed
+from dlo_calibration.page.film import film, film_motion
 from dlo_calibration.page.graph import PageGraph
 from dlo_calibration.page.information import Information
 from dlo_calibration.simulation.motion import Motion
 from dlo_calibration.vision.photograph import jpeg, png
 from dlo_calibration.workspace.folder import FILES, REQUEST, SESSION
 
-KEPT_FILMS = 8  # in memory
+MOST_FILMS = 8  # in memory
 CHAIN_FILES = {'csv': chain_csv, 'xml': chain_xml}
 
 
-class NotThere(InputError):
-    """Something was asked for by a name that does not exist."""
+class UnknownName(InputError):
+    """A request for a file or photograph by a name that does not exist."""
 
 
 class Studio:
@@ -54,13 +54,13 @@ class Studio:
         self._calibration = ProjectCalibration(project.folder, make_simulator, options)
         self._films: dict[str, Motion] = {}  # the newest last
         self._film_lock = threading.Lock()
-        self._fresh: list[str] = []  # ids of photographs that nobody has clicked on yet
+        self._fresh: list[str] = []  # ids of photographs whose tracers are not prepared yet
         self._newest: Drafts | None = None
 
     # What the page draws
 
     def state(self) -> dict[str, Any]:
-        """Return all that the page draws."""
+        """Return everything that the page draws."""
         with self._lock:
             drafts = self._drafts.plain()
             trials = [{**trial, 'information': self._information.plain(_name(k))}
@@ -71,16 +71,16 @@ class Studio:
                                     'result': self._calibration.plain_result(self._drafts.digest)},
                     'lens': self.project.lens_name, 'ros': self._graph is not None,
                     'actions': described(), 'folder': str(self.project.folder),
-                    'problems': self.project.problems}
+                    'warnings': self.project.warnings}
 
     def calibration(self) -> dict[str, Any]:
-        """Return what the page shows of the calibration, without the result."""
+        """Return the state of the calibration as the page shows it, without the result."""
         with self._lock:
             return self._calibration.plain(self._drafts.digest)
 
     def picture(self, identity: str, width: int | None) -> bytes:
         """Return a photograph as a JPEG file, see `vision.photograph.jpeg`."""
-        return jpeg(self.project.photograph(self._known(identity)), width)
+        return jpeg(self.project.photograph(self._checked(identity)), width)
 
     # What the person does
 
@@ -89,7 +89,7 @@ class Studio:
         Take a changed document, and return the state.
 
         :param document: plain values, of any kind.
-        :param revision: that it was made from.
+        :param revision: of the document that was changed.
         :raises InputError: where it is refused; OldRevision where another change came before.
         """
         with self._lock:
@@ -152,8 +152,8 @@ class Studio:
             trial = drafts[number].trial if number < len(drafts) else None
             if trial is None:
                 raise InputError(f'film of trial {number + 1}', 'a trial that is not complete',
-                                 'a complete trial', 'see what it lacks')
-            scale = self._drafts.photographs[self._known(identity)].scale
+                                 'a complete trial', 'complete it as the page says')
+            scale = self._drafts.photographs[self._checked(identity)].scale
             if scale is None:
                 raise InputError('film', 'a photograph without a scale', 'one with a scale',
                                  'give it a scale first')
@@ -161,10 +161,10 @@ class Studio:
             if description is None:
                 raise InputError('film', 'no result yet', 'a result', 'calibrate first')
         with self._film_lock:  # one simulation at a time
-            key = digest(description.physical(), description.options, trial)
-            motion = self._films.pop(key, None) or filmed(trial, description, self._make_simulator)
+            key = digest(description.physical(), description.file_options.values, trial)
+            motion = self._films.pop(key, None) or film_motion(trial, description, self._make_simulator)
             self._films[key] = motion
-            if len(self._films) > KEPT_FILMS:
+            if len(self._films) > MOST_FILMS:
                 del self._films[next(iter(self._films))]
         return film(trial, motion, scale)
 
@@ -173,7 +173,7 @@ class Studio:
         Return a file to save: the session, the request, a file of the result, or the chain of a photograph.
 
         :raises InputError: where there is no such file yet.
-        :raises NotThere: where no file has that name.
+        :raises UnknownName: where no file has that name.
         """
         with self._lock:
             if name in (SESSION, REQUEST):
@@ -184,8 +184,8 @@ class Studio:
                 return (self._calibration.folder / name).read_bytes()
             identity, _, kind = name.partition('.')
             if kind not in CHAIN_FILES:
-                raise NotThere('file', name, 'the name of a file', 'load the page again')
-            chain = self._drafts.photographs[self._known(identity)].chain
+                raise UnknownName('file', name, 'the name of a file', 'load the page again')
+            chain = self._drafts.photographs[self._checked(identity)].chain
             if chain is None:
                 raise InputError('point chain', 'a photograph without a scale or a line', 'both',
                                  'give it a scale and click along the DLO first')
@@ -217,10 +217,10 @@ class Studio:
     # Background work
 
     def tick(self) -> tuple[str, ...]:
-        """Take what happened in the background; return what changed, by the names of its methods."""
+        """Process the news of the background work; return the names of the methods with new values."""
         with self._lock:
             news = []
-            _ = self._drafts  # a project that was just opened
+            _ = self._drafts  # of a newly opened project
             if self._fresh:
                 with suppress(InputError):
                     self._drafter.prepare(self._fresh.pop(0))  # while the person looks at it
@@ -234,13 +234,13 @@ class Studio:
             return tuple(dict.fromkeys(news))
 
     def information(self) -> list[dict[str, Any]]:
-        """Return the known information of each trial, with its number from 0."""
+        """Return the information of each trial, as far as it is known, with its number from 0."""
         with self._lock:
-            known = ((k, self._information.plain(_name(k))) for k in range(len(self._drafts.trials)))
-            return [{'trial': k, **information} for k, information in known if information is not None]
+            numbered = ((k, self._information.plain(_name(k))) for k in range(len(self._drafts.trials)))
+            return [{'trial': k, **information} for k, information in numbered if information is not None]
 
     def close(self) -> None:
-        """End what goes on in the background; everything else is on the disk already."""
+        """End the background work; everything else is on the disk already."""
         with self._lock:
             self._information.close()
             self._calibration.close()
@@ -255,7 +255,7 @@ class Studio:
 
     @property
     def _drafts(self) -> Drafts:
-        """The drafts of the present document, made when they are first needed."""
+        """The drafts of the present document, made at the first use."""
         if self._newest is None:
             self._newest = self._drafter.draft()
             trials = [draft.trial for draft in self._newest.trials if draft.trial is not None]
@@ -263,11 +263,11 @@ class Studio:
         return self._newest
 
     def _complete(self) -> tuple[Trial, ...]:
-        """Return the complete trials, as a session has them."""
+        """Return the complete trials."""
         trials = self._drafts.complete
         if not trials:
             raise InputError('project', 'no complete trial', 'a start, a goal, and what the hands did',
-                             'see what the trials lack')
+                             'complete a trial as the page says')
         return trials
 
     def _write(self, name: str, given: Mapping[str, Any]) -> Path:
@@ -278,21 +278,23 @@ class Studio:
 
     def _saved(self, name: str) -> Path:
         """Write the session or request that gives `fit` the numbers of the page; return its path."""
-        shown, description = self._calibration.shown, self._calibration.description
-        unchanged = shown is not None and shown.digest == self._drafts.digest
-        return self._write(name, description.options if unchanged and description is not None else {})
+        result, description = self._calibration.result, self._calibration.description
+        unchanged = result is not None and result.digest == self._drafts.digest
+        options = description.file_options.values if unchanged and description is not None else {}
+        return self._write(name, options)
 
     def _options(self, given: Mapping[str, Any]) -> Options:
         return Options.of({**self._drafts.options, **self._given_options, **given})
 
-    def _known(self, identity: str) -> str:
+    def _checked(self, identity: str) -> str:
         """
-        Return an id that is in the document.
+        Return the id of a photograph of the document.
 
-        :raises NotThere: for another one.
+        :raises UnknownName: if it is not there.
         """
         if identity not in self.project.document.by_id:
-            raise NotThere('photograph', identity, 'the id of one of the project', 'load the page again')
+            raise UnknownName('photograph', identity, 'the id of a photograph of the project',
+                              'load the page again')
         return identity
 
     def _required_graph(self) -> PageGraph:

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What will happen, and how to get there: predictions of actions, and plans from one configuration to another.
+Predictions of actions, and plans from one configuration to another.
 
 `prediction` simulates given actions with a calibrated DLO; `planner` finds actions that bring it to a goal.
 """

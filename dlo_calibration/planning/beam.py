@@ -21,17 +21,17 @@ from dlo_calibration.planning.moves import carrying, clash, Move
 from dlo_calibration.planning.options import PlanOptions, SCORE
 from dlo_calibration.planning.rehearsal import ActionStep, in_turn, Rehearsal, RehearsalJob
 
-REFERENCE = 0  # focal point of the score: the first point, as no hand holds the DLO at the end of a plan
+REFERENCE = 0  # focal point of the score: the first point, because no hand holds the DLO after a plan
 
 DIFFERENCE = 0.012  # m, step of a finite difference; friction makes smaller ones misleading
 SHARES = (0.3, 1.0, 1.5)  # of the Gauss-Newton step that are tried together
 LONGEST = 0.15  # m, of a step of one displacement
 DAMPING = 0.02  # of the mean curvature
-WORTH = 0.97  # of the squares; a step that leaves more of them ends the refinement
+WORTH = 0.97  # share of the squares; a step that does not reduce them to less ends the refinement
 
 WIDTH = 3  # sequences that are continued
 REFINED = 4  # moves after each sequence that are refined
-ALIKE = 0.2  # of the cost; of sequences that end nearer to each other, the better one is continued
+ALIKE = 0.2  # of the cost; if two sequences end nearer to each other, only the better one is continued
 PRICE = 1.08  # factor on the cost that an action must save
 NEAR = 2.0  # times the tolerance; below that cost, all displacements are refined together
 TOGETHER = 3  # Gauss-Newton steps for all displacements of a sequence
@@ -45,9 +45,9 @@ class Objective:
     """
     The distance of chains from a goal.
 
-    It is the mean distance of the points.  With `score`, the paper's difference score for each of its terms
-    is added; alone, it would forgive all differences that cancel.  Its features are the points that an
-    annotator marked, else both ends, so that the place and the orientation of the DLO count.
+    It is the mean distance of the points.  The kind `score` adds the paper's difference score per term;
+    alone, the score would ignore differences that cancel.  Its features are the points that an annotator
+    marked, else both ends, so that the place and the orientation of the DLO count.
 
     :param start: whose marked points are features, too.
     :param kind: `points` or `score`.
@@ -66,7 +66,7 @@ class Objective:
         return self.error(points) + (self.score(points) / 100 / self._terms if self._scored else 0.0)
 
     def residuals(self, points: Floats) -> Floats:
-        """Return the (m,) [m] whose sum of squares is minimised in place of the cost."""
+        """Return (m,) residuals [m], whose sum of squares is minimised in place of the cost."""
         distances: Floats = (points - self.goal).ravel() / np.sqrt(len(points))
         if not self._scored:
             return distances
@@ -87,7 +87,7 @@ class MoveSequence:
     """
     A sequence of moves, and the DLO at rest before and after each.
 
-    :param chains: (k + 1, n, 3) [m] with the found parameters, the first one before the first move.
+    :param chains: (k + 1, n, 3) [m] with the best parameters, the first one before the first move.
     :param cost: of the last chain [m].
     """
 
@@ -102,7 +102,7 @@ class MoveSequence:
 
     @cached_property
     def chain(self) -> Chain:
-        """The chain after the last move; it is made once, because estimating its noise takes time."""
+        """The chain after the last move; made once, because estimating its noise takes time."""
         return Chain(self.end)
 
 
@@ -133,9 +133,9 @@ class Draft:
 @dataclass(frozen=True, eq=False)
 class JudgedSequence:
     """
-    A whole sequence, simulated with the found parameters and with draws from the posterior.
+    A whole sequence, simulated with the best parameters and with draws from the posterior.
 
-    :param best: with the found parameters; `drawn` with the draws.
+    :param best: with the best parameters; `drawn` with the draws.
     :param cost: mean over the draws [m].
     """
 
@@ -157,7 +157,7 @@ class BeamSearch:
     :param start: the DLO before the first move.
     :param tolerance: cost [m] at which the goal counts as reached.
     :param levels: (n,) heights [m] at which the points are put down.
-    :param physical: the found parameters by name (SI units); `draws` are such from the posterior.
+    :param physical: the best parameters by name (SI units); `draws` are draws from their posterior.
     """
 
     def __init__(self, start: Chain, objective: Objective, tolerance: float, options: PlanOptions,
@@ -169,8 +169,8 @@ class BeamSearch:
         self._levels, self._physical, self._draws = levels, physical, draws
         self._crossings = max(crossings(start.points), crossings(objective.goal))
         self._root = MoveSequence((), start.points[None], objective.cost(start.points))
-        self.best: MoveSequence = self._root  # the one that gets nearest with the found parameters, so far
-        self.actions = 0  # of the sequences that are tried now
+        self.best: MoveSequence = self._root  # the nearest so far, with the best parameters
+        self.actions = 0  # number of actions of the sequences that are tried now
         self.judged: JudgedSequence | None = None  # the best one that was simulated with draws
         self.refusals: dict[str, int] = {}  # why moves were refused -> how often
         self._watched = bool(options.no_go)  # whether the trajectory of the DLO matters
@@ -192,7 +192,7 @@ class BeamSearch:
             self._jobs = []
 
     def stop(self) -> None:
-        """End the search: ask only for what turns the best sequence so far into a plan."""
+        """End the search; ask only for the rehearsals that turn the best sequence so far into a plan."""
         self._asking = self._conclude('stopped')
         self._jobs = next(self._asking, [])
 
@@ -255,9 +255,9 @@ class BeamSearch:
 
     def _completed(self, beam: list[MoveSequence], last: bool) -> Asking[list[MoveSequence]]:
         """
-        Refine the sequences that nearly reach the goal, and judge those that do.
+        Refine the sequences that nearly reach the goal, and judge those that reach it.
 
-        :param last: they cannot be continued, so they are all refined and judged.
+        :param last: refine and judge them all, because they cannot be continued.
         :returns: all sequences, best first.
         """
         near = [sequence for sequence in beam if last or sequence.cost < NEAR * self._tolerance]
@@ -301,7 +301,7 @@ class BeamSearch:
         return self._distinct(sorted(refined, key=lambda sequence: sequence.cost))[:WIDTH]
 
     def _distinct(self, sequences: Sequence[MoveSequence]) -> list[MoveSequence]:
-        """Return sequences, best first, without those that end almost like a better one."""
+        """Return sequences, best first, without those that end nearly where a better one does."""
         distinct: list[MoveSequence] = []
         for sequence in sequences:
             if all(np.linalg.norm(sequence.end - other.end, axis=1).mean() > ALIKE * sequence.cost
@@ -311,7 +311,7 @@ class BeamSearch:
 
     def _refined(self, drafts: Sequence[Draft], sequences: Sequence[MoveSequence], iterations: int
                  ) -> Asking[list[MoveSequence]]:
-        """Refine the displacements of drafts side by side; `sequences` are the drafts as simulated."""
+        """Refine the displacements of drafts side by side; `sequences` are the simulated drafts."""
         best = list(sequences)
         refinements = [refine(draft.shifts, self._objective.residuals(sequence.end), iterations)
                        for draft, sequence in zip(drafts, sequences, strict=True)]
@@ -367,14 +367,14 @@ class BeamSearch:
         return sequence
 
     def _refusal(self, rehearsal: Rehearsal) -> str:
-        """Return why the DLO must not move like this; empty if it may."""
+        """Return why this motion of the DLO is not permitted; empty if it is."""
         if not self._options.crossings and any(
                 crossings(chain) > self._crossings for chain in rehearsal.chains):
             return 'the DLO crosses itself'
         return self._limits.entered(np.concatenate([*rehearsal.trajectories, rehearsal.chains]))
 
     def _judge(self, sequences: Sequence[MoveSequence]) -> Asking[None]:
-        """Simulate whole sequences with the found parameters and with the draws."""
+        """Simulate whole sequences with the best parameters and with the draws."""
         parameters = [self._physical, *self._draws]
         planned = [self._steps(sequence.moves, sequence.chains[:-1]) for sequence in sequences]
         jobs = [RehearsalJob(self._start, steps, physical, self._watched)
@@ -383,10 +383,10 @@ class BeamSearch:
         self._judged.update(sequences)
         for sequence, steps in zip(sequences, planned, strict=True):
             best, *drawn = islice(rehearsals, len(parameters))
-            drawn = [rehearsal for rehearsal in drawn if not rehearsal.failure]
-            if best.failure or not all(self._allowed(self._refusal(one)) for one in (best, *drawn)):
+            drawn = [draw for draw in drawn if not draw.failure]
+            if best.failure or not all(self._allowed(self._refusal(draw)) for draw in (best, *drawn)):
                 continue
-            cost = float(np.mean([self._objective.cost(one.chains[-1]) for one in drawn or [best]]))
+            cost = float(np.mean([self._objective.cost(draw.chains[-1]) for draw in drawn or [best]]))
             if self._rank(cost, len(steps)) < self._judged_rank:
                 self.judged = JudgedSequence(sequence, steps, best, tuple(drawn), cost)
 
@@ -396,11 +396,11 @@ def refine(shifts: Floats, residuals: Floats, iterations: int
     """
     Lower the sum of squared residuals by damped Gauss-Newton steps.
 
-    Yield (k, d) displacements [m] to try, and receive their residuals, None for what is impossible.  Unlike a
-    search, it has no bounds, and tries three lengths of each step side by side: a rollout takes long.
+    Yield (k, d) displacements [m] to try, and receive their residuals, None for impossible ones.  Unlike a
+    search, it has no bounds, and tries three lengths of each step side by side, because a rollout takes long.
 
-    :param shifts: (d,) [m] where it begins; `residuals` (m,) [m] there.
-    :param iterations: at most.
+    :param shifts: (d,) initial displacements [m]; `residuals` (m,) [m] there.
+    :param iterations: largest number of steps.
     """
     jacobian: Floats | None = None
     for _ in range(iterations):

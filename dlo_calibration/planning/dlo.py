@@ -21,15 +21,15 @@ Z90 = 1.6449  # standard deviations from the middle of a normal distribution to 
 
 
 class CalibratedDlo(Protocol):
-    """What a prediction needs of a `CalibrationResult`, or of the `Description` in a result file."""
+    """The part of a `CalibrationResult`, or of a `Description` from a result file, that predictions need."""
 
     @property
     def space(self) -> ParameterSpace:
-        """The found parameters, and the values of the others."""
+        """The calibrated parameters, and the values of the others."""
 
     @property
     def parameters(self) -> Mapping[str, ParameterEstimate]:
-        """The found parameters by name, in the order of `space.free`."""
+        """The calibrated parameters by name, in the order of `space.free`."""
 
     @property
     def length(self) -> float:
@@ -41,7 +41,7 @@ class CalibratedDlo(Protocol):
 
     @property
     def correlations(self) -> Mapping[str, Mapping[str, float]] | None:
-        """Correlation of each pair of found parameters; None if it is unknown."""
+        """Correlation of each pair of calibrated parameters; None if it is unknown."""
 
 
 @dataclass(frozen=True)
@@ -52,9 +52,9 @@ class Posterior:
     Each parameter is normal to either side of its value, so that 90 % of its draws lie in the interval of
     the result; draws beyond the scale are moved to its end.
 
-    :param space: the found parameters, and the values of the others.
+    :param space: the calibrated parameters, and the values of the others.
     :param length: of the DLO [m].
-    :param values: (d,) found values on the 0..100 scale, in the order of `space.free`.
+    :param values: (d,) best values on the 0..100 scale, in the order of `space.free`.
     :param below: (d,) standard deviation below them; `above` (d,) above them.
     :param correlations: (d, d).
     :param thickest: largest self-collision radius [m] of a draw.
@@ -71,11 +71,11 @@ class Posterior:
     @classmethod
     def of(cls, dlo: CalibratedDlo) -> Posterior:
         """Return the posterior of a calibrated DLO."""
-        names, known = dlo.space.free, dlo.correlations
+        names, given = dlo.space.free, dlo.correlations
         values, lower, upper = (np.array([getattr(dlo.parameters[name], end) for name in names])
                                 for end in ('value', 'lower', 'upper'))
-        correlations = np.eye(len(names)) if known is None else np.array(
-            [[known[name][other] for other in names] for name in names])
+        correlations = np.eye(len(names)) if given is None else np.array(
+            [[given[name][other] for other in names] for name in names])
         return cls(dlo.space, dlo.length, frozen_array(values),
                    frozen_array(np.maximum(values - lower, 0) / Z90),
                    frozen_array(np.maximum(upper - values, 0) / Z90),
@@ -96,7 +96,7 @@ class Posterior:
 
     @property
     def best(self) -> dict[str, float]:
-        """Physical values of all parameters at the found values, in SI units."""
+        """Best physical values of all parameters, in SI units."""
         return self._physical(self.values)
 
     def draws(self, count: int, seed: int) -> list[dict[str, float]]:

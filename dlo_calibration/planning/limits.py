@@ -47,10 +47,9 @@ class Box:
         :param begin: (m, 3) [m]; `end` (m, 3) [m] may be the same place.
         :returns: (m,)
         """
-        inside: NDArray[np.bool_] = np.all(
+        return np.asarray(np.all(
             [(place >= self.lower - ROUNDING) & (place <= self.upper + ROUNDING) for place in (begin, end)],
-            axis=(0, 2))
-        return inside
+            axis=(0, 2)))
 
     def entered(self, begin: Floats, end: Floats) -> NDArray[np.bool_]:
         """
@@ -69,14 +68,13 @@ class Box:
         within = (begin >= lower) & (begin <= upper)
         enter = np.where(along, np.where(within, -np.inf, np.inf), np.minimum(low, high)).max(axis=1)
         leave = np.where(along, np.where(within, np.inf, -np.inf), np.maximum(low, high)).min(axis=1)
-        entered: NDArray[np.bool_] = np.maximum(enter, 0.0) <= np.minimum(leave, 1.0)
-        return entered
+        return np.asarray(np.maximum(enter, 0.0) <= np.minimum(leave, 1.0))
 
 
 @dataclass(frozen=True)
 class Annulus:
     """
-    The space between two upright cylinders with one axis, at any height: what a robot arm reaches.
+    The space between two upright cylinders with one axis, at any height: the reach of a robot arm.
 
     :param centre: (2,) [m] x y of the axis.
     :param inner: radius [m]; `outer` radius [m].
@@ -95,8 +93,7 @@ class Annulus:
             nearest = np.where(square > 0, -(begin * step).sum(axis=1) / square, 0.0)
         least = np.linalg.norm(begin + np.clip(nearest, 0.0, 1.0)[:, None] * step, axis=1)
         most = np.maximum(np.linalg.norm(begin, axis=1), np.linalg.norm(end, axis=1))
-        inside: NDArray[np.bool_] = (least >= self.inner - ROUNDING) & (most <= self.outer + ROUNDING)
-        return inside
+        return np.asarray((least >= self.inner - ROUNDING) & (most <= self.outer + ROUNDING))
 
 
 Region = Union[Box, Annulus]
@@ -174,7 +171,7 @@ class Limits:
         Return which limit an action breaks: a phrase such as 'hand_1 leaves its reach, annulus 0 0 0.2 0.8'.
 
         :param action: its hands have names in HANDS; they move straight from waypoint to waypoint.
-        :returns: empty if the hands keep to their reach, and out of the boxes.
+        :returns: empty if the hands stay within their reach and out of the boxes.
         """
         for hand in action.hands:
             way = hand.positions if len(hand.positions) > 1 else hand.positions[[0, 0]]

@@ -58,20 +58,20 @@ class Move:
         if self.name == LIFTING:
             top = np.full((len(begin), 1), max(begin[:, 2].max(), level.max()) + height)
             way = [begin, np.hstack([begin[:, :2], top]), np.hstack([end[:, :2], top]), end]
-        kept, times = [way[0]], [0.0]
+        places, times = [way[0]], [0.0]
         for place in way[1:]:
-            leg = float(np.linalg.norm(place - kept[-1], axis=1).max())
+            leg = float(np.linalg.norm(place - places[-1], axis=1).max())
             if leg > SHORTEST_LEG:
-                kept.append(place)
+                places.append(place)
                 times.append(times[-1] + leg / speed)
-        path = np.array(kept)
+        path = np.array(places)
         return ActionStep(Action(tuple(Hand(name, (grip,), np.array(times), path[:, k])
                                  for k, (name, grip) in enumerate(zip(self.hands, self.grips, strict=True)))))
 
 
 def clash(action: Action) -> str:
     """
-    Return why the hands of a move get into each other's way; empty if they do not.
+    Return why the hands of a move collide; empty if they do not.
 
     :param action: its hands have waypoints at the same times, and move straight from one to the next.
     """

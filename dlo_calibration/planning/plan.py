@@ -23,7 +23,7 @@ class PlannedAction:
 
     :param name: `grasp_and_place` or `drag`.
     :param action: the paths of the hands; they close at time 0 and open where they arrive.
-    :param predicted: (n, 3) [m] with the found parameters.
+    :param predicted: (n, 3) [m] with the best parameters.
     :param lower: (n, 3) [m] lower ends of the 90 % intervals of each coordinate; `upper` (n, 3) upper ends.
     """
 
@@ -32,7 +32,6 @@ class PlannedAction:
     predicted: Floats
     lower: Floats
     upper: Floats
-
 
     def moved(self, pose: Pose) -> PlannedAction:
         """
@@ -94,15 +93,14 @@ def plain_plan(plan: Plan) -> dict[str, Any]:
 
     Lengths are in m, times in s, the score in cm.
     """
-    values: dict[str, Any] = with_nulls({
-        'actions': [plain_action(plan.start, one.name, one.action, one.predicted, one.lower, one.upper)
-                    for one in plan.actions],
+    return dict(with_nulls({
+        'actions': [plain_action(plan.start, planned.name, planned.action, planned.predicted, planned.lower,
+                                 planned.upper) for planned in plan.actions],
         'error_before_m': plan.error_before, 'error_after_m': plan.error_after,
         'error_after_percent_of_length': 100 * plan.error_after / plan.start.length,
         'score_after': plan.score_after, 'reached': plan.reached, 'tolerance_m': plan.tolerance,
         'rollouts': plan.rollouts, 'seconds': plan.seconds, 'seed': plan.seed,
-        'stop_reason': plan.stop_reason, 'remarks': plan.warnings})
-    return values
+        'stop_reason': plan.stop_reason, 'remarks': plan.warnings}))
 
 
 def plain_action(start: Chain, name: str, action: Action, predicted: Floats, lower: Floats, upper: Floats

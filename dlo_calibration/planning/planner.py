@@ -32,8 +32,8 @@ from dlo_calibration.planning.rehearsal import ActionStep, RehearsalJob, Rehears
 
 START, GOAL = 'start chain', 'goal chain'  # in errors
 OTHER_LENGTH = 0.10  # share of the length; with a larger difference, the unit or the DLO is another one
-ELSEWHERE = 0.02  # share of the length; points of start and goal that are so far apart along it do not match
-DRAWS = 3  # from the posterior, at most, that are laid on the goal
+ELSEWHERE = 0.02  # share of the length; points of start and goal match up to this difference along it
+DRAWS = 3  # largest number of draws from the posterior that are laid on the goal
 
 
 def checked(dlo: CalibratedDlo, start: Chain, goal: Chain, simulation: Options,
@@ -41,8 +41,8 @@ def checked(dlo: CalibratedDlo, start: Chain, goal: Chain, simulation: Options,
     """
     Return the start and the goal that a plan is made for.
 
-    The goal is resampled at the fractions of the length at which the start has its points, unless it has them
-    there, and is moved to the height of the start: both lie on the same table.
+    The goal is resampled at the points of the start, as fractions of the length, if it has other points.  It
+    is moved to the height of the start, because both lie on the same table.
 
     :raises InputError: if the result lacks values; if the start or the goal has another length than the DLO,
         or is in the air; if the goal is in a no-go box, or has more crossings than the start although
@@ -53,7 +53,7 @@ def checked(dlo: CalibratedDlo, start: Chain, goal: Chain, simulation: Options,
     _check_length(GOAL, goal, start.length, 'the start')
     if simulation.table and not simulation.scene:
         rise = _level(START, start, simulation.table_height) - _level(GOAL, goal, simulation.table_height)
-    elif simulation.scene:  # where it lies on obstacles, nothing is known about its height
+    elif simulation.scene:  # the height of obstacles is unknown
         rise = 0.0
     else:
         raise InputError('parameter table', 'false, and no scene', 'something that the DLO lies on',
@@ -70,12 +70,12 @@ def checked(dlo: CalibratedDlo, start: Chain, goal: Chain, simulation: Options,
 
 
 def goal_warnings(rehearse: Rehearser, posterior: Posterior, start: Chain, goal: Chain,
-            options: PlanOptions) -> tuple[str, ...]:
+                  options: PlanOptions) -> tuple[str, ...]:
     """
     Return why a goal cannot be reached exactly, and how near the DLO gets.
 
     :param rehearse: simulates at most 1 + DRAWS actions.
-    :param start: as `checked` returns it, and `goal` likewise.
+    :param start: and `goal`: from `checked`.
     :raises CancelledError: as `rehearse` does.
     """
     return (*_warnings_of_length(start, goal, options.tolerance / 100),
@@ -111,7 +111,7 @@ def _level(thing: str, chain: Chain, table_height: float) -> float:
 
 
 def _matched(goal: Chain, start: Chain, rise: float) -> Chain:
-    """Return a goal with the points of the start, higher by `rise` [m]; it is itself if nothing changes."""
+    """Return a goal with the points of the start, higher by `rise` [m]; itself if nothing changes."""
     fractions = start.arc_lengths() / start.length
     same = len(goal) == len(start) and np.abs(
         goal.arc_lengths() / goal.length - fractions).max() <= ELSEWHERE
@@ -132,7 +132,7 @@ def _warnings_of_length(start: Chain, goal: Chain, tolerance: float) -> Iterator
 
 
 def _warnings_of_limits(start: Chain, goal: Chain, options: PlanOptions) -> Iterator[str]:
-    """Warn of what no hand can reach, and of a start in a no-go box."""
+    """Warn of points that no hand can reach, and of a start in a no-go box."""
     limits, hands = options.limits, HANDS[:options.hands]
     whose = ' and '.join(hands)
     start_within, goal_within = (np.any(
@@ -196,13 +196,13 @@ def _mm(length: float) -> str:
 @dataclass(frozen=True)
 class PlanProgress:
     """
-    How far a plan has come.
+    The progress of a plan.
 
     :param actions: number of actions of the sequences that are tried now.
     :param rollouts: number of actions simulated so far.
     :param expected: estimate of their number if all permitted actions are needed.
     :param best_error: mean distance of the points from the goal after the best sequence so far [m].
-    :param seconds_left: until then.
+    :param seconds_left: until the expected number is simulated [s].
     """
 
     actions: int
@@ -212,7 +212,7 @@ class PlanProgress:
     seconds_left: float
 
 
-def plan(found: CalibratedDlo, start: Chain, goal: Chain, options: PlanOptions | None = None, *,
+def plan(dlo: CalibratedDlo, start: Chain, goal: Chain, options: PlanOptions | None = None, *,
          simulation: Options | None = None,
          on_progress: Callable[[PlanProgress], None] = lambda progress: None,
          should_stop: Callable[[], bool] = lambda: False,
@@ -221,8 +221,8 @@ def plan(found: CalibratedDlo, start: Chain, goal: Chain, options: PlanOptions |
     """
     Find the fewest actions that bring a DLO within the tolerance of a goal, or those that get nearest.
 
-    :param found: a `CalibrationResult`, or the `Description` that `read_result` returns.
-    :param start: the DLO now, at rest.
+    :param dlo: a `CalibrationResult`, or the `Description` that `read_result` returns.
+    :param start: the present chain of the DLO, at rest.
     :param options: None: the defaults.
     :param simulation: options of the simulation; None: the defaults.
     :param should_stop: once it is True, the best plan so far is returned.
@@ -230,8 +230,8 @@ def plan(found: CalibratedDlo, start: Chain, goal: Chain, options: PlanOptions |
     :raises InputError: if start, goal and DLO do not belong together; see `checked`.
     """
     options, simulation, begin = options or PlanOptions(), simulation or Options(), clock()
-    start, goal = checked(found, start, goal, simulation, options)
-    posterior = Posterior.of(found).lying(start, simulation)
+    start, goal = checked(dlo, start, goal, simulation, options)
+    posterior = Posterior.of(dlo).lying(start, simulation)
     tolerance = options.tolerance / 100 * start.length
     objective = Objective(start, goal, options.objective)
     level = None if simulation.scene else lying_level(start, simulation.table_height)
@@ -241,8 +241,9 @@ def plan(found: CalibratedDlo, start: Chain, goal: Chain, options: PlanOptions |
 
     def report(rollouts: int) -> None:
         expected = max(search.expected, rollouts)
-        left = (clock() - begin) * (expected - rollouts) / rollouts
-        on_progress(PlanProgress(search.actions, rollouts, expected, objective.error(search.best.end), left))
+        remaining = (clock() - begin) * (expected - rollouts) / rollouts
+        on_progress(PlanProgress(search.actions, rollouts, expected, objective.error(search.best.end),
+                                 remaining))
 
     with closing(make_simulator(simulation)) as simulator, closing(Threads(options.workers)) as threads:
         rehearse = Rehearser(Pool(simulator, executor or threads, should_stop))
@@ -260,7 +261,7 @@ def plan(found: CalibratedDlo, start: Chain, goal: Chain, options: PlanOptions |
     ends = [start.points] if search.judged is None else [
         rehearsal.chains[-1] for rehearsal in search.judged.drawn or [search.judged.best]]
     return Plan(
-        start, goal, () if search.judged is None else planned_actions(search.judged, found.errors.rms),
+        start, goal, () if search.judged is None else planned_actions(search.judged, dlo.errors.rms),
         error_before=objective.error(start.points),
         error_after=float(np.mean([objective.error(end) for end in ends])),
         score_after=float(np.mean([objective.score(end) for end in ends])), reached=search.reached,

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""simulate(): what happens to a calibrated DLO in a sequence of actions, and how sure that is."""
+"""simulate(): predict a calibrated DLO in a sequence of actions, with 90 % intervals."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class PredictedStep:
 
     :param name: of the action: that of a named action, else `hand_paths`; see `SimultaneousActions`.
     :param step: the paths of the hands, in the time of the whole sequence.
-    :param chain: (n, 3) [m] with the found parameters.
+    :param chain: (n, 3) [m] with the best parameters.
     :param lower: (n, 3) [m] lower ends of the 90 % intervals of each coordinate; `upper` (n, 3) upper ends.
     :param settled: False if the DLO did not come to rest within the time limit.
     """
@@ -54,10 +54,10 @@ class PredictedStep:
 @dataclass(frozen=True)
 class Prediction:
     """
-    What happens to a DLO in a sequence of actions.
+    The prediction of a DLO in a sequence of actions.
 
-    :param draws: number of draws from the posterior that were simulated, besides the found parameters.
-    :param physical: the found parameters by name (SI units), as they were simulated.
+    :param draws: number of simulated draws from the posterior, besides the best parameters.
+    :param physical: the best parameters by name (SI units).
     :param warnings: sentences for the user, such as that a draw could not be simulated.
     """
 
@@ -71,31 +71,31 @@ class Prediction:
         object.__setattr__(self, 'physical', MappingProxyType(dict(self.physical)))
 
 
-def simulate(found: CalibratedDlo, chain: Chain,
+def simulate(dlo: CalibratedDlo, chain: Chain,
              actions: Sequence[Doing], *, options: Options | None = None,
              draws: int = DRAWS, seed: int = 1, make_simulator: SimulatorFactory = make_chosen_simulator,
              should_stop: Callable[[], bool] = lambda: False) -> Prediction:
     """
     Predict the chains at rest after each action.
 
-    A named action begins where the DLO is predicted to be with the found parameters; the hands
-    then take the same paths for every draw.  Actions follow one another when the DLO is at rest.
-    Each draw also has another start, because the noise of the given one affects the prediction.
+    A named action begins at the chain that is predicted with the best parameters; the hands take the same
+    paths for every draw.  Each action begins when the DLO is at rest after the one before.  Each draw also
+    has another start, because the noise of the given one affects the prediction.
 
-    :param found: a `CalibrationResult`, or the `Description` that `read_result` returns.
+    :param dlo: a `CalibrationResult`, or the `Description` that `read_result` returns.
     :param chain: the DLO before the first action.
     :param actions: at least one; an `Action` opens its hands at the end, an `ActionStep` says which stay
         closed, and `SimultaneousActions` combines actions that overlap in time.
     :param options: of the simulation; None: the defaults.
     :param draws: from the posterior, for the intervals; 0: the intervals contain the model error only.
     :raises InputError: if an action is impossible with the chain before it.
-    :raises SimulationError: if the simulation with the found parameters diverges.
+    :raises SimulationError: if the simulation with the best parameters diverges.
     :raises CancelledError: once `should_stop` is True.
     """
     if not actions:
         raise InputError('simulate', 'no action', 'at least one', 'say what the hands do')
     options = options or Options()
-    posterior = Posterior.of(found).lying(chain, options)
+    posterior = Posterior.of(dlo).lying(chain, options)
     with closing(make_simulator(options)) as simulator, closing(Threads(options.workers)) as threads:
         pool = Pool(simulator, threads, should_stop)
         steps, best = _steps(pool, chain, actions, posterior.best)
@@ -106,7 +106,7 @@ def simulate(found: CalibratedDlo, chain: Chain,
     warnings = () if not failures else (
         f'{len(failures)} of {draws} draws from the posterior could not be simulated: {failures[0]}',)
     lower, upper = intervals(best.chains, [draw.chains for draw in drawn if not draw.failure],
-                             found.errors.rms / np.sqrt(3), finer)
+                             dlo.errors.rms / np.sqrt(3), finer)
     return Prediction(
         chain, tuple(PredictedStep(action.name, step, frozen_array(best.chains[k]), frozen_array(lower[k]),
                                    frozen_array(upper[k]), best.settled[k])
@@ -119,23 +119,23 @@ def intervals(best: Floats, drawn: Sequence[Floats], error: float,
     """
     Return the lower and upper ends of the 90 % intervals of predicted coordinates, both like `best`.
 
-    They contain the spread of the draws, the error that the calibration left (noise, and what the model
-    cannot represent), and the difference to a finer simulation.  These are independent, so their half
-    widths add as squares.
+    They contain the spread of the draws, the residual error of the calibration (noise and model error), and
+    the difference to a finer simulation.  These are independent, so their half widths add as squares.
 
-    :param best: (..., 3) [m] with the found parameters.
+    :param best: (..., 3) [m] with the best parameters.
     :param drawn: the same with draws from the posterior.
-    :param error: standard deviation of one coordinate that the calibration left [m].
+    :param error: residual error of the calibration: standard deviation of one coordinate [m].
     :param finer: like `best`, from a finer simulation; None: there is none.
     """
     everything = np.stack([best, *drawn])
     below, above = best - np.percentile(everything, INTERVAL, axis=0)
-    left = (Z90 * error)**2 + (0.0 if finer is None else (finer - best)**2)
-    return (best - np.sqrt(np.maximum(below, 0)**2 + left), best + np.sqrt(np.minimum(above, 0)**2 + left))
+    residual = (Z90 * error)**2 + (0.0 if finer is None else (finer - best)**2)
+    return (best - np.sqrt(np.maximum(below, 0)**2 + residual),
+            best + np.sqrt(np.minimum(above, 0)**2 + residual))
 
 
 def _starts(chain: Chain, draws: int, seed: int) -> list[Chain]:
-    """Return a start for each draw: the measured chain with as much noise again as it has."""
+    """Return a start for each draw: the measured chain with added noise of the same level."""
     level = noise_of([chain.points[None]])
     if not level > NO_NOISE:  # nan, too
         return [chain] * draws
@@ -156,7 +156,7 @@ def _finer(pool: Pool, job: RehearsalJob) -> Floats | None:
 
 def _steps(pool: Pool, chain: Chain, actions: Sequence[Doing],
            physical: dict[str, float]) -> tuple[tuple[ActionStep, ...], Rehearsal]:
-    """Return the actions as steps in turn, and their rehearsal with the found parameters."""
+    """Return the actions as steps in turn, and their rehearsal with the best parameters."""
     steps: list[ActionStep] = []
     for action in actions:
         if isinstance(action, NamedAction):
@@ -205,9 +205,8 @@ def plain_prediction(prediction: Prediction) -> dict[str, Any]:
 
     Lengths are in m, times in s.
     """
-    values: dict[str, Any] = with_nulls({
+    return dict(with_nulls({
         'actions': [{**plain_action(prediction.start, step.name, step.step.action, step.chain, step.lower,
                                     step.upper),
                      'held_by': step.step.held_by, 'settled': step.settled} for step in prediction.steps],
-        'draws': prediction.draws, 'remarks': prediction.warnings})
-    return values
+        'draws': prediction.draws, 'remarks': prediction.warnings}))

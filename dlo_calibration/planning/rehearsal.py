@@ -20,8 +20,8 @@ from dlo_calibration.simulation.motion import FRAME_RATE, MOST_FRAMES, Motion
 from dlo_calibration.simulation.protocol import Rollout, Simulator
 
 PAUSE = 1.0  # s from the end of an action to the start of the next; the DLO rests then, however long it takes
-CALM = 1.5  # s of the same in a motion, which does not wait longer: a DLO that was let go nearly rests then
-REST = 0.01  # s from the end of an action to the instant from which on the DLO comes to rest
+CALM = 1.5  # s of the same in a motion, which does not wait for rest: a released DLO nearly rests by then
+REST = 0.01  # s from the end of an action to the goal at rest
 TRAJECTORY_STEP = 0.01  # m that a hand moves, at most, between two chains of a trajectory
 
 
@@ -48,13 +48,13 @@ class ActionStep:
 @dataclass(frozen=True)
 class Rehearsal:
     """
-    What happens in a sequence of actions.
+    The simulated outcome of a sequence of actions.
 
-    :param chains: (k, n, 3) [m] the DLO at rest after each of the k actions.
+    :param chains: (k, n, 3) [m] the DLO at rest after each of the k actions; nan after a failure.
     :param settled: (k,) False where it did not come to rest within the time limit.
     :param trajectories: of each action, (m, n, 3) [m] the DLO while the hands move, at every TRAJECTORY_STEP;
-        empty if they were not asked for.
-    :param failure: why it could not be simulated, in words; empty if it could.  `chains` is nan then.
+        empty if they were not requested.
+    :param failure: why it could not be simulated, in words; empty if it could.
     """
 
     chains: Floats
@@ -114,7 +114,7 @@ def rehearse(pool: Pool, jobs: Sequence[RehearsalJob]) -> list[Rehearsal]:
 
     :raises CancelledError: when the pool stops.
     """
-    # Draws of the same actions share their trial, as a simulator lays out each trial anew.
+    # Draws of the same actions share their trial, because a simulator scripts every trial anew.
     keys = [(id(job.start), id(job.steps), job.trajectories) for job in jobs]
     shared = {key: rehearsed_trial(job.start, job.steps, job.trajectories)
               for key, job in dict(zip(keys, jobs, strict=True)).items()}
@@ -125,7 +125,7 @@ def rehearse(pool: Pool, jobs: Sequence[RehearsalJob]) -> list[Rehearsal]:
 
 
 def _rehearsal(job: RehearsalJob, trial: Trial, rollout: Rollout | SimulationError) -> Rehearsal:
-    """Return what happened in the rollout of a job's trial."""
+    """Return the rehearsal of a job from the rollout of its trial."""
     if isinstance(rollout, SimulationError):
         return Rehearsal(np.full((len(job.steps), len(job.start), 3), np.nan), (False,) * len(job.steps),
                          failure=str(rollout))
@@ -159,7 +159,7 @@ def motion_of_actions(start: Chain, steps: Sequence[ActionStep], simulator: Simu
     """
     Simulate the motion of a DLO, frame by frame, in actions one after the other.
 
-    Unlike in a rehearsal, an action begins CALM after the one before, whether or not the DLO rests then.
+    Unlike in a rehearsal, an action begins CALM after the previous one, whether or not the DLO rests then.
 
     :param physical: parameters by name (SI units).
     :param frame_rate: [1/s], less where there would be more than `most` frames.

@@ -13,6 +13,7 @@ from typing import Any, Callable, Iterator, Mapping, Sequence
 import numpy as np
 from PIL.Image import Dither, fromarray, Image
 
+from dlo_calibration.evaluation.evaluation import with_hands
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import number
 from dlo_calibration.model.trial import Trial
@@ -56,9 +57,9 @@ def write_animation(trial: Trial, motion: Motion, path: str | Path,
         frames = [scene.frame(float(time), chain, f't = {time:.2f} s')  # of constant width
                   for time, chain in zip(motion.times, motion.chains, strict=True)]
         frames.append(scene.frame(float(motion.times[-1]), motion.ends[-1], 'at the end'))
-    # All frames have the same colours. To look for those of each frame takes twenty times as long.
+    # All frames share a palette. To choose one for each frame takes twenty times as long.
     colours = frames[0].quantize(dither=Dither.NONE)
-    first, *others = (one.quantize(palette=colours, dither=Dither.NONE) for one in frames)
+    first, *others = (frame.quantize(palette=colours, dither=Dither.NONE) for frame in frames)
     with whole(Path(path)) as new:
         first.save(new, 'GIF', save_all=True, append_images=others, loop=0,
                    duration=[*[1000 // FRAME_RATE] * len(others), PAUSE])
@@ -70,13 +71,14 @@ def write_animations(trials: Sequence[Trial], simulator: Simulator, physical: Ma
     Simulate trials and write ``trial_1.gif``, ``trial_2.gif``, ... into a folder, which is created.
 
     :param physical: parameters by name (SI units).
-    :param note: called with the path of each file after it was written.
+    :param note: called with the path of each written file.
     :param numbers: of the trials.
     :raises DloCalibrationError: if files cannot be written; the others are.
     :raises SimulationError: if a trial cannot be simulated.
     """
     return write_numbered(
-        (partial(write_animation, trial, simulated_motion(trial, simulator, physical)) for trial in trials),
+        (partial(write_animation, trial, simulated_motion(trial, simulator, physical))
+         for trial in (with_hands(trial, physical) for trial in trials)),
         folder, '.gif', note, numbers)
 
 
@@ -100,8 +102,8 @@ class _Scene:
         self._tracked = bool(captions.goal) and any(not goal.stable for goal in trial.goals)
         self._title = self._figure.suptitle(' ', fontweight='bold')
         axes = self._figure.subplots(1, 2)
-        for one, above in zip(axes, (True, False), strict=True):
-            self._moving.append(self._prepare(View(one, trial, above=above), motion))
+        for subplot, above in zip(axes, (True, False), strict=True):
+            self._moving.append(self._prepare(View(subplot, trial, above=above), motion))
         add_legend(self._figure, list(axes), columns=3)
         for artist in self._artists():
             artist.set_animated(True)  # so that `draw` leaves it out

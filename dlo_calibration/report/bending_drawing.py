@@ -26,8 +26,8 @@ from dlo_calibration.report.sentences import keeps_bends
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-DRAWS, KEPT = 60, 54  # of the posterior: nine of ten are drawn
-FINE, COARSE = 240, 60  # pieces of a curve, and of one of many
+DRAWS, SHOWN = 60, 54  # of the posterior: nine of ten are shown
+FINE, COARSE = 240, 60  # pieces of a curve that is alone, and of one among many
 PREFIXES = ((1.0, ''), (1e-3, 'm'), (1e-6, 'µ'))  # of units
 
 
@@ -41,14 +41,14 @@ def rest_shape_panels(result: CalibrationResult) -> list[Panel]:
     shape = (shape - shape.mean(axis=0)) @ _best_axes(shape)
     places, fine = np.linspace(0, len(shape) - 1, drawn.shape[1]), np.arange(len(shape))
     same = np.stack([np.interp(places, fine, values) for values in shape.T], axis=1)
-    moved = np.array([_moved_onto(one, same) for one in drawn])
-    moved = moved[np.argsort(np.square(moved - same).sum(axis=(1, 2)), kind='stable')[:KEPT]]
+    moved = np.array([_moved_onto(curve, same) for curve in drawn])
+    moved = moved[np.argsort(np.square(moved - same).sum(axis=(1, 2)), kind='stable')[:SHOWN]]
     words = (f'The rest shape, {measured(length, "m")} long: its ends are '
              f'{measured(float(np.linalg.norm(shape[-1] - shape[0])), "m")} apart, and it extends '
              f'{measured(float(np.ptp(shape[:, 2])), "m")} across the plane that fits it best')
 
-    def view(axes: list[int], title: str, legend: bool) -> Panel:
-        return panel(lambda one: _draw_shape(one, shape[:, axes], moved[..., axes], title),
+    def view(columns: list[int], title: str, legend: bool) -> Panel:
+        return panel(lambda axes: _draw_shape(axes, shape[:, columns], moved[..., columns], title),
                      f'{words}; {title}', legend)
 
     return [view([0, 1], 'rest shape, on the plane that fits it best', legend=True),
@@ -66,7 +66,8 @@ def moment_panels(result: CalibrationResult) -> list[Panel]:
     stiffness, unit = space.reported('flexibility', flexibility)
     # As far as the trials bent it, but so that slip and what stays can be seen.
     reach = float(np.clip(_largest_curvature(result.chains), friction + 3 * slip, 4 * (friction + slip)))
-    scale, prefix = next((one for one in PREFIXES if stiffness * (reach + friction) >= one[0]), PREFIXES[-1])
+    largest = stiffness * (reach + friction)
+    scale, prefix = next((pair for pair in PREFIXES if largest >= pair[0]), PREFIXES[-1])
     stiffness, unit = stiffness / scale, prefix + unit.replace('N m^2', 'N m')
     first = np.linspace(0, reach, FINE + 1)
     path = np.concatenate([first, np.linspace(reach, -reach, 2 * FINE + 1)[1:],
@@ -98,8 +99,8 @@ def moment_panels(result: CalibrationResult) -> list[Panel]:
 def _largest_curvature(chains: Sequence[Floats]) -> float:
     """Return the largest curvature [1/m] of the chains (g, n, 3) [m] of each trial."""
     largest = 0.0
-    for one in chains:
-        segments = np.diff(one, axis=1)
+    for chain in chains:
+        segments = np.diff(chain, axis=1)
         lengths = np.linalg.norm(segments, axis=2)
         bends = np.linalg.norm(np.diff(segments / lengths[..., None], axis=1), axis=2)
         largest = max(largest, float((2 * bends / (lengths[:, 1:] + lengths[:, :-1])).max()))
@@ -109,8 +110,8 @@ def _largest_curvature(chains: Sequence[Floats]) -> float:
 def _shapes(drawn: Sequence[dict[str, float]], length: float, pieces: int) -> Floats:
     """Return the rest shapes (k, pieces + 1, 3) [m] for k sets of physical values, of their own lengths."""
     places = np.linspace(0, 1, pieces + 1)[1:-1]
-    curvatures = np.array([natural_curvature(one, places) * one['length_scale'] for one in drawn])
-    lengths = np.array([one['length_scale'] for one in drawn])
+    curvatures = np.array([natural_curvature(values, places) * values['length_scale'] for values in drawn])
+    lengths = np.array([values['length_scale'] for values in drawn])
     return np.asarray(rest_shape(curvatures, length) * lengths[:, None, None])
 
 

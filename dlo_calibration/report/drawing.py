@@ -19,10 +19,9 @@ from dlo_calibration.inference.uncertainty import DEVIATIONS
 from dlo_calibration.model.action import Hand
 from dlo_calibration.model.chain import Floats, grip_place
 from dlo_calibration.model.parameters import interval, measured, number
-from dlo_calibration.model.score import differences, PointErrors, residuals
+from dlo_calibration.model.score import differences, MEAN_DISTANCE, PointErrors, residuals
 from dlo_calibration.model.trial import shown_goals, Trial
 from dlo_calibration.report import figure
-from dlo_calibration.report.sentences import MEAN_DISTANCE
 from dlo_calibration.writing import Attempts, make_folder
 
 if TYPE_CHECKING:
@@ -74,13 +73,13 @@ class Drawn:
         """
         Choose at most five goals: the last, and those with the largest errors.
 
-        Of goals that show the same rest, and of those of a stream that are seen at about the same time, only
-        one is chosen. Where nothing was simulated, they are spread over the trial.
+        Only one is chosen of goals that show the same rest, or that a stream has at about the same time.
+        Where nothing was simulated, they are spread over the trial.
         """
         goals = self.trial.goals
         points, times = np.stack([goal.chain.points for goal in goals]), [goal.time for goal in goals]
         most = len(INSTANT_COLOURS)
-        apart = (times[-1] - times[0]) / (2 * most) if len(goals) > most else 0.0
+        spacing = (times[-1] - times[0]) / (2 * most) if len(goals) > most else 0.0
         order = np.array(shown_goals(len(goals)))
         if self.chains is not None:
             seen = np.stack([goal.chain.observed for goal in goals])
@@ -89,7 +88,7 @@ class Drawn:
         for k in map(int, order):
             away = np.linalg.norm(points[chosen] - points[k], axis=2).mean(axis=1)
             if len(chosen) < most and away.min() > SAME_PLACE * self.trial.initial.length \
-                    and min(abs(times[k] - times[one]) for one in chosen) >= apart:
+                    and min(abs(times[k] - times[goal]) for goal in chosen) >= spacing:
                 chosen.append(k)
         return sorted(chosen)
 
@@ -130,7 +129,7 @@ def write_pictures(trials: Sequence[Trial], chains: Sequence[Floats] | None, fol
     """
     Write ``trial_1.png``, ``trial_2.png``, ... into a folder, which is created; see `session_picture`.
 
-    :param note: called with the path of each file after it was written.
+    :param note: called with the path of each written file.
     :param numbers: of the trials.
     :raises DloCalibrationError: if files cannot be written; the others are.
     """
@@ -166,14 +165,14 @@ def trial_panels(drawn: Drawn) -> list[figure.Panel]:
                for axis, values in zip('xyz', off[-1].T, strict=True))
     return [
         figure.panel(lambda axes: draw_view(axes, drawn, above=True),
-              f'{name} seen from above: the measured and the simulated chain'),
+                     f'{name} seen from above: the measured and the simulated chain'),
         figure.panel(lambda axes: draw_view(axes, drawn, above=False),
-              f'{name} seen from the side: the measured and the simulated chain', legend=False),
+                     f'{name} seen from the side: the measured and the simulated chain', legend=False),
         figure.panel(lambda axes: draw_errors(axes, drawn),
-              f'{name}, error of each point: the mean is {measured(errors.mean, "m")}, '
-              f'the largest {measured(errors.max, "m")}'),
+                     f'{name}, error of each point: the mean is {measured(errors.mean, "m")}, '
+                     f'the largest {measured(errors.max, "m")}'),
         figure.panel(lambda axes: _draw_differences(axes, drawn),
-              f'{name}, residuals by coordinate: {", ".join(by_axis)}')]
+                     f'{name}, residuals by coordinate: {", ".join(by_axis)}')]
 
 
 def hand_colours(trials: Sequence[Trial]) -> Mapping[str, str]:
@@ -191,9 +190,9 @@ class View:
     """
     Axes that show a trial from one side.
 
-    :param above: look from above; else from the side, along the horizontal
-        direction in which the trial extends least.
-    :param extent: (m, 3) [m] points that take the place of the trial's chains in that.
+    :param above: whether to look from above; else from the side, along the horizontal direction in which the
+        trial extends least.
+    :param extent: (m, 3) [m] points that determine this direction; None: those of the trial's chains.
     """
 
     def __init__(self, axes: Axes, trial: Trial, *, above: bool, extent: Floats | None = None) -> None:
@@ -267,7 +266,7 @@ class View:
         """Mark the first point of the DLO."""
         self.axes.plot(*self.flat(self.trial.initial.points[:1]), 'o', markersize=11, markerfacecolor='none',
                        markeredgecolor=figure.OBSERVED, linestyle='none', zorder=6,
-                        label='first point of the DLO')
+                       label='first point of the DLO')
 
     def draw_hands(self, colours: Mapping[str, str]) -> None:
         """Draw the paths of the hands, with their first and last points."""

@@ -61,9 +61,9 @@ def panel(draw: Callable[[Axes], None], words: str, legend: bool = True) -> Pane
         height = HEIGHT + 0.17 * (lines + 0.5 * (lines > 0))
         figure.set_size_inches(WIDTH, height)
         bars = figure.axes[1:]
-        for one, x, width in ((axes, left, WIDTH - left - right - BAR_ROOM * len(bars)),
+        for part, x, width in ((axes, left, WIDTH - left - right - BAR_ROOM * len(bars)),
                               *((bar, WIDTH - BAR_ROOM + 0.1, 0.15) for bar in bars)):
-            one.set_position((x / WIDTH, (height - HEIGHT + bottom) / height, width / WIDTH,
+            part.set_position((x / WIDTH, (height - HEIGHT + bottom) / height, width / WIDTH,
                               (HEIGHT - top - bottom) / height))
         if lines:
             figure.legend(handles, labels, loc='lower left', bbox_to_anchor=(0.02, 0), frameon=False,
@@ -109,8 +109,8 @@ def write_figure(figure: Figure, path: str | Path) -> None:
 def add_legend(figure: FigureBase, axes: Sequence[Axes], columns: int = 4) -> None:
     """Add a legend below the figure for all `axes`, with each label once."""
     shown: dict[str, Any] = {}
-    for one in axes:
-        for handle, label in zip(*one.get_legend_handles_labels(), strict=True):
+    for subplot in axes:
+        for handle, label in zip(*subplot.get_legend_handles_labels(), strict=True):
             shown.setdefault(label, handle)
     legend_outside(figure, 'lower center', handles=list(shown.values()), labels=list(shown),
                    ncols=min(columns, len(shown)))

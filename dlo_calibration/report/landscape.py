@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 def convergence_panel(result: CalibrationResult) -> Panel:
     """Draw the score of every evaluation, and the best one so far."""
     counts = np.arange(1, len(result.evaluations) + 1)
-    scores = np.array([one.score for one in result.evaluations])
-    finished = np.array([not one.failure for one in result.evaluations])
+    scores = np.array([evaluation.score for evaluation in result.evaluations])
+    finished = np.array([not evaluation.failure for evaluation in result.evaluations])
     best = np.minimum.accumulate(np.where(finished, scores, np.inf))
 
     def draw(axes: Axes) -> None:
@@ -79,10 +79,10 @@ def _line(result: CalibrationResult, line: Line, legend: bool) -> Panel:
 
 
 def _plane(result: CalibrationResult, plane: Plane, what: str, unit: str, values: Floats) -> Panel:
-    one, two = plane.names
-    known = values[np.isfinite(values)]
-    low = max(float(known.min()), 1e-3 * float(known.max()))
-    high = max(float(known.max()), 1.01 * low)
+    first, second = plane.names
+    finite = values[np.isfinite(values)]
+    low = max(float(finite.min()), 1e-3 * float(finite.max()))
+    high = max(float(finite.max()), 1.01 * low)
 
     def draw(axes: Axes) -> None:
         from matplotlib.colors import LogNorm
@@ -97,10 +97,11 @@ def _plane(result: CalibrationResult, plane: Plane, what: str, unit: str, values
         if region is not None:
             axes.plot(*region, '--', color=SIMULATED, label='90 % region of both parameters')
         _mark(axes, *(result.parameters[name].value for name in plane.names))
-        axes.set(title=f'{what} [{unit}]', xlabel=f'{one} [0 to 100]', ylabel=f'{two} [0 to 100]',
+        axes.set(title=f'{what} [{unit}]', xlabel=f'{first} [0 to 100]', ylabel=f'{second} [0 to 100]',
                  xlim=plane.values[0, [0, -1]], ylim=plane.values[1, [0, -1]])
 
-    return panel(draw, f'{what} over {one} and {two}: from {number(low)} {unit} to {number(high)} {unit}')
+    return panel(draw, f'{what} over {first} and {second}: from {number(low)} {unit} to {number(high)} '
+                       f'{unit}')
 
 
 def _region(result: CalibrationResult, plane: Plane) -> Floats | None:

@@ -20,17 +20,15 @@ from dlo_calibration.errors import printable
 from dlo_calibration.inference.slices import Slices
 from dlo_calibration.inference.uncertainty import IDENTIFIABLE, NOT_IDENTIFIABLE, WEAK
 from dlo_calibration.model.parameters import exact, measured, number
-from dlo_calibration.model.score import PointErrors, residuals, SIMILAR, VERY_SIMILAR
+from dlo_calibration.model.score import MEAN_DISTANCE, PointErrors, residuals, SIMILAR, VERY_SIMILAR
 from dlo_calibration.report.bending_drawing import moment_panels, rest_shape_panels
 from dlo_calibration.report.drawing import Drawn, trial_panels
 from dlo_calibration.report.landscape import convergence_panel, line_panels, plane_panels
 from dlo_calibration.report.sentences import (
     fit_facts,
     lower_score,
-    MEAN_DISTANCE,
     parameter_rows,
     sentences,
-    verdict,
 )
 
 if TYPE_CHECKING:
@@ -49,14 +47,14 @@ class Origin:
     :param command: the command that gives the same result again.
     :param options: of the calibration.
     :param digests: SHA-256 of each input file, by name.
-    :param problems: of the session, in words.
+    :param warnings: about the session.
     """
 
     session: str
     command: str
     options: Options
     digests: Mapping[str, str] = field(default_factory=dict)
-    problems: Sequence[str] = ()
+    warnings: Sequence[str] = ()
 
 
 def repeating_command(session: str, options: Options, selection: Sequence[str] = ()) -> str:
@@ -75,7 +73,6 @@ def page_of(result: CalibrationResult, origin: Origin, slices: Slices | None = N
     values = plain(result)
     return _template().render(
         values=values, result=result, origin=origin, slices=slices, sentences=sentences(result),
-        verdict=verdict(result),
         rows=parameter_rows(values['parameters'], result.space),
         correlated=most_correlated(values['correlations']),
         marks={IDENTIFIABLE: 'good', WEAK: 'weak', NOT_IDENTIFIABLE: 'bad', '': ''},  # classes of the style
@@ -83,7 +80,8 @@ def page_of(result: CalibrationResult, origin: Origin, slices: Slices | None = N
         rest_shapes=rest_shape_panels(result), moments=moment_panels(result),
         convergence=convergence_panel(result), **_trials(result), lower_score=lower_score(result),
         lines=[] if slices is None else line_panels(result, slices.lines),
-        planes=[] if slices is None else [(one.names, plane_panels(result, one)) for one in slices.planes],
+        planes=[] if slices is None else [
+            (plane.names, plane_panels(result, plane)) for plane in slices.planes],
         versions={name: _version(name) for name in
                   ('dlo_calibration', 'numpy', 'scipy', 'pybullet')},
         system=f'{platform.python_version()}, {platform.system()} {platform.machine()}',
@@ -109,7 +107,7 @@ def most_correlated(correlations: Mapping[str, Mapping[str, float]] | None) -> l
     """Return the pairs of parameters with the largest correlations if there are too many for a table."""
     if correlations is None or len(correlations) <= MOST_CORRELATIONS:
         return []
-    pairs = [(one, other, correlations[one][other]) for one, other in combinations(correlations, 2)]
+    pairs = [(first, second, correlations[first][second]) for first, second in combinations(correlations, 2)]
     return sorted(pairs, key=lambda pair: -abs(pair[2]))[:MOST_CORRELATIONS]
 
 

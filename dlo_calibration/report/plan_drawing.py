@@ -54,10 +54,10 @@ def write_plan_picture(plan: Plan, path: str | Path) -> None:
         figure = blank_figure(width, 4.6 * rows + 1.0)
         figure.suptitle(textwrap.fill(_title(plan), round(9 * width)), fontweight='bold')
         panels = list(figure.subplots(rows, columns, squeeze=False).flat)
-        for one in panels[len(trials):]:
-            one.remove()
+        for axes in panels[len(trials):]:
+            axes.remove()
         everything = _extent([plan.start.points, plan.goal.points], plan.actions,
-                             (hand for one in plan.actions for hand in one.action.hands))
+                             (hand for step in plan.actions for hand in step.action.hands))
         for k, (axes, trial) in enumerate(zip(panels, trials, strict=False)):
             view = View(axes, trial, above=True)
             view.draw_start('before the action' if plan.actions else 'the DLO')
@@ -91,25 +91,25 @@ def write_plan_animation(plan: Plan, simulator: Simulator, physical: Mapping[str
 
 def plan_trial(plan: Plan) -> Trial:
     """Return a trial with the actions of a plan, at least one, in turn; each goal is that of the plan."""
-    trial = rehearsed_trial(plan.start, [ActionStep(one.action) for one in plan.actions])
-    goal = Chain(plan.goal.points)  # an object of its own, also where the start is the goal
-    return replace(trial, name='plan', goals=tuple(replace(one, chain=goal) for one in trial.goals))
+    trial = rehearsed_trial(plan.start, [ActionStep(step.action) for step in plan.actions])
+    chain = Chain(plan.goal.points)  # an object of its own, also where the start is the goal
+    return replace(trial, name='plan', goals=tuple(replace(goal, chain=chain) for goal in trial.goals))
 
 
 def _trials(plan: Plan) -> list[Trial]:
     """Return a trial for each panel: the DLO before an action, the action, and the goal of the plan."""
-    after = [one.predicted for one in plan.actions[:-1]]
+    after = [step.predicted for step in plan.actions[:-1]]
     # A trial has an action, so that where there is none to draw, its hand does nothing.
     nothing = Action((Hand('', (0,), np.zeros(1), plan.start.points[:1]),))
     return [Trial(str(k), chain, (action,), (Goal(plan.goal, action.end + 1.0),)) for k, (chain, action) in
             enumerate(zip([plan.start, *map(Chain, after)],
-                          [one.action for one in plan.actions] or [nothing], strict=True))]
+                          [step.action for step in plan.actions] or [nothing], strict=True))]
 
 
 def _extent(chains: Sequence[Floats], steps: Sequence[PlannedAction | PredictedStep],
             hands: Iterable[Hand]) -> Floats:
     """Return points, (m, 3) [m], among which all of these lie."""
-    return np.concatenate([*chains, *(part for one in steps for part in (one.lower, one.upper)),
+    return np.concatenate([*chains, *(part for step in steps for part in (step.lower, step.upper)),
                            *(hand.positions for hand in hands)])
 
 
@@ -171,7 +171,7 @@ def write_prediction_picture(prediction: Prediction, name: str, path: str | Path
               for chain, step in zip(before, prediction.steps, strict=False)]
     colours, shown = hand_colours(trials), shown_goals(len(trials))
     everything = _extent([prediction.start.points], prediction.steps,
-                         (hand for one in prediction.steps for hand in one.step.action.hands))
+                         (hand for step in prediction.steps for hand in step.step.action.hands))
     with settings():
         figure = blank_figure(11, 3.9 * len(shown) + 1.0)
         figure.suptitle(as_text(f'{name}, predicted'), fontweight='bold')
@@ -202,7 +202,7 @@ def write_prediction_animation(prediction: Prediction, name: str, simulator: Sim
     :raises InputError: if the file cannot be written.
     :raises SimulationError: if the simulation diverges.
     """
-    trial, motion = motion_of_actions(prediction.start, [one.step for one in prediction.steps], simulator,
+    trial, motion = motion_of_actions(prediction.start, [step.step for step in prediction.steps], simulator,
                                       prediction.physical, most=MOST_FRAMES)
     write_animation(trial, motion, path, Captions(f'{name}, simulated', 'start', ''))
 

@@ -11,7 +11,7 @@ from typing import Any, Mapping, TYPE_CHECKING
 
 import numpy as np
 
-from dlo_calibration.calibration.result import CalibrationResult
+from dlo_calibration.calibration.result import CalibrationResult, NOT_USABLE
 from dlo_calibration.inference.missing_parameters import PARTS
 from dlo_calibration.inference.trial_information import uninformative
 from dlo_calibration.inference.uncertainty import IDENTIFIABLE, MODEL_ERROR, NOT_IDENTIFIABLE, WEAK
@@ -28,30 +28,23 @@ from dlo_calibration.model.parameters import (
     PER_WEIGHT,
     SCALE,
 )
-from dlo_calibration.model.score import SIMILAR, VERY_SIMILAR
+from dlo_calibration.model.score import MEAN_DISTANCE, SIMILAR, VERY_SIMILAR
 
 if TYPE_CHECKING:
     from dlo_calibration.planning.plan import Plan
     from dlo_calibration.planning.prediction import PredictedStep, Prediction
 
-#: Mean length of a vector of three normal coordinates with standard deviation 1 (Maxwell distribution).
-MEAN_DISTANCE = float(np.sqrt(8 / np.pi))
 MOST_COMBINATIONS = 3  # of parameters that the trials do not determine, in sentences
-
-
-def verdict(result: CalibrationResult) -> str:
-    """Return the first sentence that a user should read: whether the parameters can be used, or why not."""
-    return f'Do not use this result: {result.unusable}.' if result.unusable else 'This result is usable.'
 
 
 def sentences(result: CalibrationResult) -> list[str]:
     """Return sentences on the parameters and their uncertainty, the next action, and how well the fit is."""
-    return [*_known(result), *rest_shape_sentences(result), *friction_sentences(result),
-            *_undetermined(result), *_uninformative(result), *_advice(result), *_fit(result),
-            *filter(None, [lower_score(result)]), *_missing_parameters(result)]
+    return [*_parameters(result), *rest_shape_sentences(result), *friction_sentences(result),
+            *_advice(result), *_uninformative(result), *_fit(result), *_missing_parameters(result),
+            *_undetermined(result)]
 
 
-def _known(result: CalibrationResult) -> list[str]:
+def _parameters(result: CalibrationResult) -> list[str]:
     """Return a sentence on each parameter but the knots of the rest shape, the most certain ones first."""
     by_verdict: dict[str, list[str]] = {IDENTIFIABLE: [], WEAK: [], NOT_IDENTIFIABLE: []}
     alone = [name for name in result.parameters if name not in knot_names(result.space.knots)]
@@ -59,10 +52,12 @@ def _known(result: CalibrationResult) -> list[str]:
         p = result.parameters[name]
         verdict = p.verdict or (IDENTIFIABLE if p.identifiable else NOT_IDENTIFIABLE)
         quantity = BY_NAME[name].quantity
-        value = measured(p.physical_value, p.physical_unit)
+        value = measured(p.physical_value, p.physical_unit, p.physical_upper)
         ends = BY_NAME[name].interval(p.lower, p.upper, (p.physical_lower, p.physical_upper), p.physical_unit)
         bound = ends.startswith('at ')  # at least, at most
-        if verdict == NOT_IDENTIFIABLE:
+        if p.note == NOT_USABLE:
+            words = f'{name} is not known, as {NOT_USABLE}: {quantity} {value} fits best'
+        elif verdict == NOT_IDENTIFIABLE:
             words = f'{name} could not be determined'
             words += f': with these trials, {quantity} is only known to be {ends}' if bound else \
                 f' ({p.note}): {quantity} {value}' if p.note else \
@@ -84,11 +79,8 @@ def _known(result: CalibrationResult) -> list[str]:
 
 
 def _undetermined(result: CalibrationResult) -> list[str]:
-    combinations = result.undetermined
-    more = len(combinations) - MOST_COMBINATIONS
-    return [*(f'This combination of parameters can change while the fit stays nearly the same: {words}.'
-              for words in combinations[:MOST_COMBINATIONS]),
-            *([f'So can {more} more combinations.'] if more > 0 else [])]
+    return [f'This combination of parameters can change while the fit stays nearly the same: {words}.'
+            for words in result.undetermined[:MOST_COMBINATIONS]]
 
 
 def _uninformative(result: CalibrationResult) -> list[str]:
@@ -97,12 +89,12 @@ def _uninformative(result: CalibrationResult) -> list[str]:
 
 
 def _advice(result: CalibrationResult) -> list[str]:
-    one = result.advice
-    if one is None:
+    advice = result.advice
+    if advice is None:
         return []
-    return [f'To know {one.parameter} better, {one.words} (action {one.action}). On the scale from 0 to '
-            f'100, that should bring its standard deviation from {number(one.std * SCALE)} to '
-            f'{number(one.expected_std * SCALE)}.']
+    return [f'To know {advice.parameter} better, {advice.words} (action {advice.action}). On the scale from '
+            f'0 to 100, that should bring its standard deviation from {number(advice.std * SCALE)} to '
+            f'{number(advice.expected_std * SCALE)}.']
 
 
 def _fit(result: CalibrationResult) -> list[str]:
@@ -128,7 +120,7 @@ def _fit(result: CalibrationResult) -> list[str]:
 
 def lower_score(result: CalibrationResult) -> str:
     """Say why the result is not the evaluation with the lowest difference score; empty if it is."""
-    lowest, best = min(result.evaluations, key=lambda one: one.score), result.best
+    lowest, best = min(result.evaluations, key=lambda evaluation: evaluation.score), result.best
     if lowest.score >= best.score or number(lowest.score) == number(best.score):
         return ''
     return (f'Evaluation {lowest.index + 1} has a lower difference score than the result, '
@@ -139,10 +131,11 @@ def lower_score(result: CalibrationResult) -> str:
 
 def _missing_parameters(result: CalibrationResult) -> list[str]:
     """Name fixed parameters to calibrate, too."""
-    shares = [f'{one.name} {number(100 * one.share)} %' for one in result.missing_parameters]
+    missing = result.missing_parameters
+    shares = [f'{parameter.name} {number(100 * parameter.share)} %' for parameter in missing]
     if not shares:
         return []
-    names = [one.name for one in result.missing_parameters if one.name != PARTS]
+    names = [parameter.name for parameter in missing if parameter.name != PARTS]
     beside = ', '.join(name for name in result.space.free if name not in knot_names(result.space.knots))
     how = [f'name {" or ".join(names)} in calibrate, beside {beside}'] * bool(names)
     how += ['set parts to 0 (bending stiffness that differs along the DLO)'] * (len(names) < len(shares))
@@ -156,11 +149,10 @@ class Row:
     One parameter in words, or both components of the curvature at a knot.
 
     :param name: for people; that of a knot names both components.
-
     :param value: on the 0..100 scale, with its interval `ends`.
     :param physical: the same in physical units, with its interval `physical_ends`.
     :param verdict: of the less certain component.
-    :param note: a remark; may be empty.
+    :param note: why the parameter is uncertain; may be empty.
     """
 
     name: str
@@ -177,19 +169,20 @@ def parameter_rows(parameters: Mapping[str, Mapping[str, Any]], space: Parameter
     """Return the rows for the parameters in the plain values of a result."""
     rows, names = [], knot_names(space.knots)
     pairs = dict(zip(names[::2], names[1::2], strict=True))
-    for name, one in parameters.items():
+    for name, values in parameters.items():
         if name in pairs and pairs[name] in parameters:
             place = number(100 * (int(name[-1]) - 1) / (space.knots - 1))
             rows.append(_knot(f'rest_curvature {name[-1]}', f'at {place} % of the length, x and y',
-                              one, parameters[pairs[name]]))
+                              values, parameters[pairs[name]]))
         elif not any(name == second and first in parameters for first, second in pairs.items()):
-            unit = one['physical_unit']
+            unit = values['physical_unit']
             rows.append(Row(
-                name, BY_NAME[name].quantity, number(one['value']), interval(one['lower'], one['upper'], '1'),
-                measured(one['physical_value'], unit),
-                BY_NAME[name].interval(one['lower'], one['upper'],
-                                       (one['physical_lower'], one['physical_upper']), unit),
-                one['verdict'], one['note']))
+                name, BY_NAME[name].quantity, number(values['value']),
+                interval(values['lower'], values['upper'], '1'),
+                measured(values['physical_value'], unit, values['physical_upper']),
+                BY_NAME[name].interval(values['lower'], values['upper'],
+                                       (values['physical_lower'], values['physical_upper']), unit),
+                values['verdict'], values['note']))
     return rows
 
 
@@ -198,16 +191,17 @@ def _knot(name: str, quantity: str, *pair: Mapping[str, Any]) -> Row:
 
     def ends(prefix: str) -> str:
         """Return how far the intervals reach, to the wider side."""
-        return ', '.join(f'±{number(max(one[f"{prefix}upper"] - value, value - one[f"{prefix}lower"]))}'
-                         for one in pair for value in (one[f'{prefix}value'],))
+        reaches = (max(component[f'{prefix}upper'] - value, value - component[f'{prefix}lower'])
+                   for component in pair for value in (component[f'{prefix}value'],))
+        return ', '.join(f'±{number(reach)}' for reach in reaches)
 
     x, y = pair
     return Row(
         name, quantity, f'{number(x["value"])}, {number(y["value"])}', ends(''),
         f'{number(x["physical_value"])}, {measured(y["physical_value"], unit)}',
         f'{ends("physical_")} {unit}',
-        max(pair, key=lambda one: float(one['std']))['verdict'],
-        '; '.join(dict.fromkeys(one['note'] for one in pair if one['note'])))
+        max(pair, key=lambda component: float(component['std']))['verdict'],
+        '; '.join(dict.fromkeys(component['note'] for component in pair if component['note'])))
 
 
 def fit_facts(values: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -239,20 +233,20 @@ DRAWS = 200  # of the posterior, for an interval
 
 
 def rest_shape_sentences(result: CalibrationResult) -> list[str]:
-    """Say how curved a DLO is when nothing bends it, and where; nothing if its rest shape has no knots."""
+    """Say how curved a DLO is when nothing bends it, and where; nothing if that is not known."""
     names = [name for name in knot_names(result.space.knots) if name in result.parameters]
-    if not names:
+    if not names or result.unusable:
         return []
     from dlo_calibration.planning.dlo import Posterior  # the planner comes with it, which few results need
 
     places = np.linspace(0, 1, 101)
     size = np.hypot(*natural_curvature(result.physical(), places).T)
     most = int(size.argmax())
-    drawn = [float(np.hypot(*natural_curvature(one, places[most:most + 1])[0]))
-             for one in Posterior.of(result).draws(DRAWS, seed=0)]
+    drawn = [float(np.hypot(*natural_curvature(draw, places[most:most + 1])[0]))
+             for draw in Posterior.of(result).draws(DRAWS, seed=0)]
     low, high = np.percentile(drawn, (5, 95)).tolist()
     verdicts = Counter(result.parameters[name].verdict for name in names)
-    known = [f'{verdicts[verdict]} {words}' for verdict, words in (
+    shares = [f'{verdicts[verdict]} {words}' for verdict, words in (
         (IDENTIFIABLE, 'are known well'), (WEAK, 'only roughly'),
         (NOT_IDENTIFIABLE, 'could not be determined')) if verdicts[verdict]]
     return [
@@ -261,7 +255,7 @@ def rest_shape_sentences(result: CalibrationResult) -> list[str]:
         f'{interval(low, high, "1/m")}; least at {number(100 * places[size.argmin()])} %, by '
         f'{measured(size.min(), "1/m")}.',
         f'Of the {len(names)} components of this rest shape, {names[0]} to {names[-1]}, '
-        f'{", ".join(known)}.']
+        f'{", ".join(shares)}.']
 
 
 def friction_sentences(result: CalibrationResult) -> list[str]:
@@ -297,10 +291,10 @@ FLAT = 1e-3  # m; a hand that rises by less stays on the table
 def plan_sentences(plan: Plan) -> list[str]:
     """Return sentences on the actions, whether they reach the goal or why the search ended, and warnings."""
     steps = []
-    for k, one in enumerate(plan.actions, start=1):
-        hands = '; '.join(_hand(plan.start, hand, 'drags', 2) for hand in one.action.hands)
-        steps.append(f'{k}. {one.name}: {hands}; then the points are {distance(plan, one.predicted)} from '
-                     'the goal on average.')
+    for k, action in enumerate(plan.actions, start=1):
+        hands = '; '.join(_hand(plan.start, hand, 'drags', 2) for hand in action.action.hands)
+        steps.append(f'{k}. {action.name}: {hands}; then the points are '
+                     f'{distance(plan, action.predicted)} from the goal on average.')
     ended = [] if plan.reached else [f'The search ended: {plan.stop_reason}.']
     return [*steps, outcome(plan), *ended, *map(_sentence, plan.warnings)]
 
@@ -376,4 +370,4 @@ def _hand(start: Chain, hand: Hand, on_the_table: str, axes: int, after: str = '
 
 def _place(point: Floats) -> str:
     """Return a place, (2,) or (3,) [m], in words."""
-    return f'({", ".join(f"{one:.3f}" for one in point.round(3) + 0.0)})'  # no -0.000
+    return f'({", ".join(f"{coordinate:.3f}" for coordinate in point.round(3) + 0.0)})'  # no -0.000

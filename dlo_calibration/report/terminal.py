@@ -31,12 +31,10 @@ from dlo_calibration.report.sentences import fit_facts, parameter_rows
 if TYPE_CHECKING:
     from dlo_calibration.planning.planner import PlanProgress
 
-LONGEST_TEXT = 2000  # characters of a cell or a sentence: more than any of ours
-
 
 def escape(text: str) -> str:
     """Return a text for a console, which obeys nothing in it; names of a session can be anything."""
-    return markup.escape(safe_line(text, LONGEST_TEXT))
+    return markup.escape(safe_line(text))
 
 
 def console(stream: TextIO) -> Console:
@@ -76,14 +74,14 @@ class SearchBar(_Bar):
 
     :param total: largest number of evaluations.
     :param shown: False: nothing is shown on a terminal, either.
-    :param known: number of evaluations that come from a log: they do not count for the time left.
+    :param logged: number of evaluations that come from a log: they do not count for the time left.
     """
 
-    def __init__(self, total: int, stream: TextIO, shown: bool = True, known: int = 0) -> None:
+    def __init__(self, total: int, stream: TextIO, shown: bool = True, logged: int = 0) -> None:
         super().__init__('calibrating', [TextColumn('best score {task.fields[best]}'), TimeRemainingColumn()],
                          stream, shown, total=total, best='-')
         self._best = float('inf')
-        self._known = known
+        self._logged = logged
 
     def take(self, evaluation: Evaluation) -> None:
         """Advance by one evaluation."""
@@ -92,7 +90,7 @@ class SearchBar(_Bar):
     def move(self, count: int, best: float) -> None:
         """Show that `count` evaluations were made, and their best score."""
         self._best = best
-        if count <= self._known:  # the speed is that of what comes after
+        if count <= self._logged:  # the speed is that of the others
             self._progress.reset(self._task, completed=count, best=number(best))
         else:
             self._progress.update(self._task, completed=count, best=number(best))
@@ -102,8 +100,8 @@ class TaskBar(_Bar):
     """
     A progress bar with the time left.
 
-    :param what: is being counted; the label of the bar.
-    :param done: number of the `total` that is done already.
+    :param what: the label of the bar.
+    :param done: how many of the `total` are done already.
     """
 
     def __init__(self, what: str, total: int, done: int, stream: TextIO) -> None:
@@ -148,7 +146,7 @@ def print_result(result: CalibrationResult, stream: TextIO,
     :param how: plain values that replace those of the result.
     """
     out, values = console(stream), {**plain(result), **how}
-    out.print(escape(sentences.verdict(result)))
+    out.print(escape(result.headline))
     if values['choice']:
         out.print(escape(values['choice']))
     numbers = (Column(title, justify='right') for title in (
@@ -163,39 +161,40 @@ def print_result(result: CalibrationResult, stream: TextIO,
 
 def print_info(about: Mapping[str, Any], stream: TextIO) -> None:
     """Print the JSON document of `info` as tables."""
-    out, unknown = console(stream), {one['topic']: one for one in about['unknown_topics']}
+    out, unknown = console(stream), {topic['topic']: topic for topic in about['unknown_topics']}
     defaults = Options().flat()
     recorded = [f'{name} {value}' for name, value in (about['options'] or {}).items()
                 if name != 'calibrate' and value != defaults.get(name)]
     facts = [('trials', str(len(about['trials'])))]
     if about['messages']:  # a request has none
         facts += [('duration', f"{number(about['duration_s'])} s"),
-                  ('frame', ', '.join(repr(shortened(frame, 100)) for frame in about['frames']) or '-'),
+                  ('frame', ', '.join(repr(shortened(frame)) for frame in about['frames']) or '-'),
                   *((topic, f"{count} message{'s' * (count != 1)}")
                     for topic, count in about['messages'].items() if topic not in unknown)]
     out.print(_table(about['session'], [
-        *facts, ('options', shortened(', '.join(recorded)) or 'all have their defaults'),
+        *facts, ('options', ', '.join(recorded) or 'all have their defaults'),
         ('calibrate', about['choice'].removeprefix('Calibrated: ') or ', '.join(about['calibrate']))]))
     if unknown:
         keys = ('topic', 'type', 'messages')
         out.print(_table('topics that the calibrator does not know', [
-            [str(one[key]) for key in keys] for one in unknown.values()], keys))
-    for one in filter(lambda one: one['hint'], unknown.values()):
-        out.print(escape(f'hint: {one["hint"]}'), soft_wrap=True)
+            [str(topic[key]) for key in keys] for topic in unknown.values()], keys))
+    for topic in filter(lambda topic: topic['hint'], unknown.values()):
+        out.print(escape(f'hint: {topic["hint"]}'), soft_wrap=True)
     if about['trials']:
         head = ('number', 'name', 'points', 'length', 'hands', 'goals', 'duration', 'remarks')
         out.print(_table('trials', [
             (str(trial['number']), trial['name'], str(trial['points']), measured(trial['length_m'], 'm'),
-             ', '.join(f"{shortened(hand['name'], 100)} ({_grips(hand)})" for hand in trial['hands']),
+             ', '.join(f"{shortened(hand['name'])} ({_grips(hand)})" for hand in trial['hands']),
              f"{trial['stable_goals']} stable, {trial['timed_goals']} timed",
              f"{number(trial['duration_s'])} s",
              ', '.join(word for word, there in (
+                 ('not used', not trial['used']),
                  (f"mean of {trial['averaged_chains']} chains at rest", trial['averaged_chains']),
                  ('annotated hands', trial['annotated_hands']),
                  (f"{trial['annotated_features']} annotated features", trial['annotated_features']),
                  (f"unseen points: {trial['unseen_points']}", trial['unseen_points'])) if there) or '-')
             for trial in about['trials']], head))
-    for title in ('refusals', 'problems'):
+    for title in ('refusals', 'problems', 'notes'):
         for text in about[title]:
             out.print(escape(f'{title[:-1]}: {text}'))
 

@@ -32,7 +32,7 @@ from dlo_calibration.model.pose import NUMBERS, Pose
 from dlo_calibration.ros.graph_node import GraphNode, SLICE
 from dlo_calibration.ros.session import CalibrationSession
 
-LIMIT = 64_000_000  # bytes that wait: 100,000 chains of 40 points, and few beside the 1 GB of a small robot
+LIMIT = 64_000_000  # bytes that wait: 100,000 chains of 40 points, and little of the 1 GB of a small robot
 OVERHEAD = 200  # bytes of a waiting message, besides its content
 PUBLISHERS = 64  # on a topic; those that were silent for longest are forgotten
 
@@ -41,9 +41,10 @@ class Inbox:
     """
     Messages that came and wait to be collected, and requests between them.
 
-    A message was dropped if its publisher's next one has a number beyond the next: the queue
-    below rclpy keeps only the newest ones.  Those before its first one are not counted: nobody may have
-    listened yet.  rclpy hides the publisher; continuing the nearest lower number still gives the right total.
+    A message was dropped if its publisher's next one has a number beyond the next: the queue below rclpy
+    keeps only the newest ones.  Those before its first one are not counted: they may have been sent before
+    the node listened.  rclpy hides the publisher; continuing the nearest lower number still gives the right
+    total.
     """
 
     def __init__(self) -> None:
@@ -104,7 +105,7 @@ class Inbox:
     @staticmethod
     def _gap(last: list[int], number: int) -> int:
         """Return how many messages are missing before one with this number."""
-        before = max((one for one in last if one < number), default=None)
+        before = max((earlier for earlier in last if earlier < number), default=None)
         if before is None:
             before = number - 1  # a publisher that is new
             del last[:len(last) + 1 - PUBLISHERS]
@@ -153,7 +154,7 @@ class TableFrame:
         self._name, self.pose = options.table_frame, None
 
     def applied(self, options: Options) -> Options:
-        """Return the options with the pose in place of the name; empty as long as it is missing."""
+        """Return the options with the pose in place of the name; none while it is missing."""
         if options.table_frame is None:
             return options
         return replace(options, frame_pose='' if self.pose is None else str(self.pose))
@@ -206,7 +207,7 @@ class CalibratorNode(GraphNode[Options]):
         for name in self.session.requests:
             self.create_service(Trigger, f'~/{name}', functools.partial(self._serve, name))
         self._jump: TimeJump | None = None  # of the node's clock, back
-        # rclpy calls nobody, or crashes, where this is not kept.
+        # Without this reference, rclpy never calls back, or crashes.
         self._jumps = self.get_clock().create_jump_callback(
             JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-MARGIN)),
             post_callback=self._on_jump)
@@ -255,7 +256,7 @@ class CalibratorNode(GraphNode[Options]):
         """Collect waiting messages for some seconds; if more are left, call this again soon."""
         if not self._in_frame():
             return
-        if self._changed:  # what comes next is judged with the new values
+        if self._changed:  # for the next messages
             self._changed = False
             self.session.change_options()
         self._working = True

@@ -13,15 +13,7 @@ import time
 from typing import Any, Callable, Sequence
 
 from dlo_calibration.errors import InputError
-from dlo_calibration.messages.codec import (
-    action_trajectory,
-    ActionMessage,
-    chain_cloud,
-    INPUT_TYPES,
-    NANOSECONDS,
-    OUTPUT_TYPES,
-    rclpy_types,
-)
+from dlo_calibration.messages.codec import built, INPUT_TYPES, NANOSECONDS, OUTPUT_TYPES, rclpy_types
 from dlo_calibration.messages.encoder import trial_messages
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.page.graph import TopicImage
@@ -64,15 +56,15 @@ class CaptureGraph:
                                  'choose one of the list')
             # Compressed images are one level below the raw ones (image_transport).
             camera, _, image = topic.removesuffix('/compressed').rpartition('/')
-            beside = f'{camera}/camera_info'
-            wanted = [topic, beside] if kinds.get(beside) == INFO else [topic]
+            about = f'{camera}/camera_info'
+            wanted = [topic, about] if kinds.get(about) == INFO else [topic]
             heard = self._heard({name: kinds[name] for name in wanted})
         if topic not in heard:
             raise InputError(f'topic {topic}', f'no image within {PATIENCE:.0f} s', 'a camera that publishes',
                              'check that it does, and with which quality of service')
         message = heard[topic]
         picture = bytes(message.data) if kinds[topic] == COMPRESSED else decoded(f'image on {topic}', message)
-        return TopicImage(picture, _lens(heard.get(beside), 'rect' in image))
+        return TopicImage(picture, _lens(heard.get(about), 'rect' in image))
 
     def send(self, trials: Sequence[Trial], namespace: str) -> str:
         """
@@ -99,7 +91,7 @@ class CaptureGraph:
                 self._context = None
 
     def _join(self) -> None:
-        """Take part in the graph, if that is not so yet."""
+        """Join the graph, unless the page takes part in it already."""
         if self._context is not None:
             return
         try:
@@ -145,8 +137,8 @@ class CaptureGraph:
         try:
             self._spin(lambda: len(heard) == len(topics), PATIENCE)
         finally:
-            for one in subscriptions:
-                self._node.destroy_subscription(one)
+            for subscription in subscriptions:
+                self._node.destroy_subscription(subscription)
         return heard
 
     def _send(self, trials: Sequence[Trial], name: str) -> str:
@@ -158,32 +150,30 @@ class CaptureGraph:
         status = self._node.create_subscription(types.find(OUTPUT_TYPES['status']), f'{name}/status',
                                                 heard.append, latched)
         publishers = {
-            kind: self._node.create_publisher(types.find(one), f'{name}/{kind}', QoSProfile(depth=1000))
-            for kind, one in INPUT_TYPES.items()}
+            kind: self._node.create_publisher(types.find(type_name), f'{name}/{kind}', QoSProfile(depth=1000))
+            for kind, type_name in INPUT_TYPES.items()}
         try:
             if not self._spin(lambda: bool(heard) and all(
-                    one.get_subscription_count() for one in publishers.values()), PATIENCE):
+                    publisher.get_subscription_count() for publisher in publishers.values()), PATIENCE):
                 raise InputError(f'node {name}', 'no calibrator that listens', 'one that is running',
                                  'start it with: ros2 run dlo_calibration calibrator')
             before = int(_value(heard[-1], 'trials') or 0)
             for message in self._stamped(trials):
-                publishers[message.kind].publish(
-                    action_trajectory(types, message) if isinstance(message, ActionMessage) else
-                    chain_cloud(types, message.chain, message.stamp, message.frame_id))
+                publishers[message.kind].publish(built(types, message))
             self._spin(lambda: int(_value(heard[-1], 'trials') or 0) >= before + len(trials), PATIENCE)
             count, refusal = int(_value(heard[-1], 'trials') or 0), _value(heard[-1], 'last_refusal')
         finally:
             self._node.destroy_subscription(status)
-            for one in publishers.values():
-                self._node.destroy_publisher(one)
+            for publisher in publishers.values():
+                self._node.destroy_publisher(publisher)
         text = f'sent {len(trials)}: {name} had {before} trials, and has {count} now'
         return text if count >= before + len(trials) or not refusal else f'{text}; it refused: {refusal}'
 
     def _stamped(self, trials: Sequence[Trial]) -> list[Any]:
-        """Return the messages of trials, later than all that were sent before: else they would mix."""
+        """Return the messages of trials, stamped later than all sent before, so that trials do not mix."""
         messages = trial_messages(trials, FRAME)
         later = max(time.time_ns(), self._latest + NANOSECONDS) - messages[0].stamp
-        stamped = [replace(one, stamp=one.stamp + later) for one in messages]
+        stamped = [replace(message, stamp=message.stamp + later) for message in messages]
         self._latest = stamped[-1].stamp
         return stamped
 
@@ -197,12 +187,12 @@ def _lens(info: Any, rectified: bool) -> bytes | None:
     """
     Return a ROS camera calibration file from a CameraInfo; None if the camera is not calibrated.
 
-    :param rectified: the image has no distortion any more; then the projection matrix holds (image_proc).
+    :param rectified: the image is free of distortion; then the projection matrix holds (image_proc).
     """
     if info is None or not info.k[0] > 0 or (rectified and not info.p[0] > 0):
         return None
     values = [info.p[k] for k in (0, 1, 2, 4, 5, 6, 8, 9, 10)] if rectified else info.k
-    matrix = [float(one) for one in values]
+    matrix = [float(value) for value in values]
     distortion = [0.0] * 5 if rectified or not len(info.d) else [float(x) for x in info.d]
     return json.dumps({  # JSON is YAML, too
         'image_width': int(info.width), 'image_height': int(info.height), 'camera_name': 'camera',

@@ -55,9 +55,7 @@ def result(types: MessageTypes, outcome: CalibrationResult, stamp: int) -> Any:
     left_out = ('parameters', 'correlations', 'advice', 'explanations', 'confirmation')
     statuses.append((
         WARN if outcome.warnings or outcome.unusable else OK, WHOLE,
-        f'{sentences.verdict(outcome)} Score {number(outcome.best.score)}, '
-        f'mean error {measured(outcome.errors.mean, "m")}; '
-        f'{outcome.stop_reason}',
+        f'{outcome.headline} Score {number(outcome.best.score)}; {outcome.stop_reason}',
         {**_pairs({key: values[key] for key in values if key not in left_out}),
          'findings': ' '.join(sentences.sentences(outcome)),
          **_pairs(values['confirmation'] or {}, 'confirmation_')}))
@@ -66,9 +64,10 @@ def result(types: MessageTypes, outcome: CalibrationResult, stamp: int) -> Any:
 
 def in_one_line(outcome: CalibrationResult) -> str:
     """Return the values, errors and end of a calibration as one line for the log."""
-    parameters = ', '.join(f'{name} {number(one.value)} ({interval(one.lower, one.upper, "1")}), '
-                       f'{measured(one.physical_value, one.physical_unit)}'
-                       for name, one in outcome.parameters.items())
+    parameters = ', '.join(
+        f'{name} {number(estimate.value)} ({interval(estimate.lower, estimate.upper, "1")}), '
+        f'{measured(estimate.physical_value, estimate.physical_unit)}'
+        for name, estimate in outcome.parameters.items())
     return (f'calibrated: {parameters}; score {outcome.best.score:.1f}, mean error '
             f'{outcome.errors.mean * 1e3:.2f} mm; {outcome.stop_reason}')
 

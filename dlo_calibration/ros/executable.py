@@ -51,7 +51,7 @@ def execute(program: str, args: Sequence[str]) -> int:
 
         return spin(program, getattr(import_module(module), node), args, stop)
     except ImportError as error:
-        if stop():  # an import that a signal disturbs may fail in any way
+        if stop():  # a signal can make an import fail in any way
             return 0
         sys.stderr.write(f'{program}: {error}; source a ROS 2 Jazzy installation, and install what README.md '
                          'of the package names: rosdep install, and pip install -r requirements.txt\n')

@@ -53,7 +53,8 @@ class OptionsNode(Node, Generic[Chosen]):
 
     def __init__(self, name: str, kind: type[Chosen], **arguments: Any) -> None:
         self._kind = kind
-        self._declared: Mapping[str, Declaration] = {one.name: one for one in kind.declarations()}
+        self._declared: Mapping[str, Declaration] = {
+            declaration.name: declaration for declaration in kind.declarations()}
         super().__init__(name, automatically_declare_parameters_from_overrides=True, **arguments)
         try:
             self._declare()
@@ -89,7 +90,8 @@ class OptionsNode(Node, Generic[Chosen]):
 
     def _declare(self) -> None:
         """Declare the parameters; those that the user gave replace what rclpy declared without a range."""
-        given = {name: _plain(one.value) for name, one in self.get_parameters_by_prefix('').items()
+        given = {name: _plain(parameter.value)
+                 for name, parameter in self.get_parameters_by_prefix('').items()
                  if not name.startswith(ROS_PARAMETERS)}
         chosen = self._checked(given)
         for name in given:
@@ -243,7 +245,7 @@ class GraphNode(OptionsNode[Chosen]):
         self._handler = _WarningHandler(self.warn)
         LOG.addHandler(self._handler)
         self.types = rclpy_types()
-        self.classes = {kind: self.types.find(one) for kind, one in inputs.items()}
+        self.classes = {kind: self.types.find(type_name) for kind, type_name in inputs.items()}
         self.inputs: dict[str, Any] = {}  # subscriptions
         self.reactions: dict[str, Callable[[str, Any], None]] = {
             'incompatible_qos': self.on_incompatible_qos}
@@ -365,7 +367,7 @@ class GraphNode(OptionsNode[Chosen]):
             self.fail(f'{error!r}; {DEFECT}')
 
     def _look_for_namesakes(self) -> None:
-        """Refuse once that another node has the same name; check every second, as it may start later."""
+        """Refuse another node of the same name, once; check every second, as it may start later."""
         if time.monotonic() - self._looked < 1.0:
             return
         self._looked = time.monotonic()
@@ -417,8 +419,8 @@ def _waiting(subscription: Any, seconds: float) -> Iterator[tuple[bytes, Mapping
     until = time.monotonic() + seconds  # a publisher may be as fast as this loop
     with subscription.handle:
         while time.monotonic() < until \
-                and (taken := subscription.handle.take_message(subscription.msg_type, True)) is not None:
-            yield taken
+                and (message := subscription.handle.take_message(subscription.msg_type, True)) is not None:
+            yield message
 
 
 def _lines(text: str) -> str:

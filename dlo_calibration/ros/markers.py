@@ -75,16 +75,17 @@ def error_colour(share: float) -> Colour:
 def alike(trials: Sequence[Trial], others: Sequence[Trial]) -> bool:
     """Return whether trials look the same: only the mean of a stream that goes on may differ."""
     return len(trials) == len(others) and all(
-        len(one.actions) == len(two.actions) and np.array_equal(one.initial.points, two.initial.points)
-        and _same(one, two) for one, two in zip(trials, others, strict=True))
+        len(trial.actions) == len(other.actions) and _same(trial, other)
+        and np.array_equal(trial.initial.points, other.initial.points)
+        for trial, other in zip(trials, others, strict=True))
 
 
 def _same(trial: Trial, other: Trial) -> bool:
     """Return whether two trials have the same goals; a tracker that goes on changes the mean of a stream."""
     return trial is other or len(trial.goals) == len(other.goals) and all(
-        min(one.count, two.count) > 1 and one.time == two.time or one.chain is two.chain
-        or np.array_equal(one.chain.points, two.chain.points)
-        for one, two in zip(trial.goals, other.goals, strict=True))
+        min(goal.count, shown.count) > 1 and goal.time == shown.time or goal.chain is shown.chain
+        or np.array_equal(goal.chain.points, shown.chain.points)
+        for goal, shown in zip(trial.goals, other.goals, strict=True))
 
 
 def _trial_markers(brush: Brush, trial: Trial, chains: Floats | None, k: int) -> Iterator[Any]:
@@ -180,7 +181,7 @@ class Brush:
         """
         build, point = self._types.build, self._types.find('geometry_msgs/msg/Point')
         points = np.zeros((0, 3)) if points is None else points
-        kept = _kept(len(points), group)
+        shown = _shown(len(points), group)
         x, y, z = self._pose.points(np.zeros(3) if at is None else at).tolist()
         turn = dict(zip('xyzw', self._pose.orientation.tolist(), strict=True))
         size = scale * self.thickness
@@ -193,8 +194,8 @@ class Brush:
             scale=build('geometry_msgs/msg/Vector3', x=size, y=size, z=size),
             color=self._colour(colours[0]),
             lifetime=self._lifetime, frame_locked=False,
-            points=[point(x=x, y=y, z=z) for x, y, z in points[kept].tolist()],
-            colors=[self._colour(colours[k]) for k in kept] if len(colours) > 1 else [],
+            points=[point(x=x, y=y, z=z) for x, y, z in points[shown].tolist()],
+            colors=[self._colour(colours[k]) for k in shown] if len(colours) > 1 else [],
             texture_resource='', texture=self._texture, uv_coordinates=[], text=text, mesh_resource='',
             mesh_file=self._mesh, mesh_use_embedded_materials=False)
 
@@ -203,7 +204,7 @@ class Brush:
         return self._types.build('std_msgs/msg/ColorRGBA', r=red, g=green, b=blue, a=1.0)
 
 
-def _kept(count: int, group: int) -> list[int]:
+def _shown(count: int, group: int) -> list[int]:
     """Return the indices of at most MOST_POINTS groups, evenly spread over `count` points."""
     groups = count // group
     if groups <= MOST_POINTS:

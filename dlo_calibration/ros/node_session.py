@@ -56,11 +56,12 @@ class NodeState:
     """
     What the status says of either node.
 
-    :param detail: about the state, e.g. why the node failed.
+    :param name: of the state, e.g. FAILED.
+    :param detail: about it, e.g. why the node failed.
     :param counted: the refusals, by their reason.
     """
 
-    state: str
+    name: str
     detail: str = ''
     last_refusal: str = ''
     counted: Refusals = field(default_factory=Refusals)
@@ -83,15 +84,15 @@ class NodeSession(Generic[Chosen_co]):
     def __init__(self, graph: NodeInterface[Chosen_co], types: MessageTypes, inputs: Mapping[str, str],
                  state: NodeState, clock: Callable[[], float]) -> None:
         self._graph, self._types, self._inputs, self._clock = graph, types, inputs, clock
-        self._situation = state
+        self._state = state
         self.requests: Mapping[str, Callable[[], str]] = {}
         self._status: dict[str, Any] = {}  # content of the last message
         self._status_sent = float('-inf')  # [s]
 
     def refuse(self, text: str) -> None:
         """Report a refusal in the log and in ``~/status``; a repeated reason only now and then."""
-        self._situation.last_refusal = self._situation.counted.add(safe_line(text))
-        self._tell_refusals()
+        self._state.last_refusal = self._state.counted.add(safe_line(text))
+        self._report_refusals()
 
     def request(self, name: str) -> tuple[bool, str]:
         """Serve one of the `requests`; return whether that succeeded, and the answer."""
@@ -106,7 +107,7 @@ class NodeSession(Generic[Chosen_co]):
 
     def fail(self, text: str, *log: str) -> None:
         """Report a failure in ``~/status`` and in the log; `log` has the lines of the log if they differ."""
-        self._situation.state, self._situation.detail = FAILED, safe_line(text)
+        self._state.name, self._state.detail = FAILED, safe_line(text)
         for line in log or (text,):
             self._graph.error(line)
         self._report()
@@ -128,8 +129,8 @@ class NodeSession(Generic[Chosen_co]):
         self._status, self._status_sent = content, now
         return True
 
-    def _tell_refusals(self) -> None:
-        self._warn(self._situation.counted.due(self._clock()))
+    def _report_refusals(self) -> None:
+        self._warn(self._state.counted.due(self._clock()))
 
     def _warn(self, texts: Sequence[str]) -> None:
         for text in texts:

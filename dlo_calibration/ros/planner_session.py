@@ -17,7 +17,7 @@ import time
 from typing import Any, Callable, Mapping, Union
 
 from dlo_calibration.calibration.engines import SimulatorFactory
-from dlo_calibration.calibration.options import Declaration, declared, MACHINE, Options, SIMULATION
+from dlo_calibration.calibration.options import declared, MACHINE, Options, SIMULATION
 from dlo_calibration.errors import DEFECT, InputError
 from dlo_calibration.files.result import Description, read_description
 from dlo_calibration.messages.codec import action_trajectory, ChainMessage, MessageTypes, NANOSECONDS, read
@@ -68,7 +68,7 @@ class Newest:
         """
         Read the message that waits; return whether there was one.
 
-        :raises InputError: if it cannot be used; the content stays as it was.
+        :raises InputError: if it cannot be used; the content does not change.
         """
         if self._waiting is None:
             return False
@@ -80,7 +80,6 @@ class Newest:
 
 
 PLAN, PUBLISH = 'plan', 'publish'  # modes
-WORDS = {'true': True, 'false': False}
 
 
 @dataclass(frozen=True)
@@ -113,14 +112,15 @@ class PlannerOptions(PlanOptions):
 
         :raises InputError: for an unknown name or a bad value.
         """
-        known = {one.name: one for one in Options.declarations() if one.name in SIMULATION}
+        declarations = {declaration.name: declaration for declaration in Options.declarations()
+                        if declaration.name in SIMULATION}
         values: dict[str, Any] = {}
         for text in self.simulation:
             name, equals, value = text.partition('=')
-            if not equals or name not in known:
+            if not equals or name not in declarations:
                 raise InputError('parameter simulation', repr(text), "'name=value' with a name out of "
                                  f'{", ".join(SIMULATION)}', 'correct it')
-            values[name] = _read(known[name], value)
+            values[name] = declarations[name].read(value)
         Options.of(values)
         return {**values, 'frame_pose': self.frame_pose} if self.frame_pose else values
 
@@ -133,15 +133,6 @@ class PlannerOptions(PlanOptions):
         if self.mode == PUBLISH and not self.description:
             raise InputError('parameter description', 'an empty text', 'a path, in the mode publish',
                              'name the result.xml to publish')
-
-
-def _read(declaration: Declaration, text: str) -> Any:
-    """Convert a text to the type of an option; return it unchanged if that fails."""
-    kind = type(declaration.default)
-    try:
-        return WORDS[text] if kind is bool else kind(text)
-    except (KeyError, ValueError):
-        return text
 
 
 CHAIN, GOAL, DESCRIPTION = 'chain', 'goal_chain', 'dlo_description'
@@ -159,7 +150,7 @@ OUTPUT_TYPES: Mapping[str, str] = {
     STEPS: 'std_msgs/msg/String',
 }
 LARGEST_DESCRIPTION = 10**6  # bytes; a DLO of 10,000 points needs less, and it is read within 0.2 s
-PROGRESS_PERIOD = 0.1  # s between two messages; nobody reads faster
+PROGRESS_PERIOD = 0.1  # s between two messages, which people read
 FIRST = 'the first actions are simulated'
 PATIENCE = 0.5  # s that closing waits for the planning thread
 
@@ -208,8 +199,8 @@ class PlannerSession(NodeSession[PlannerOptions]):
         :param origin: where it came from, in words.
         """
         self._description, self._origin = description, origin
-        for problem in description.problems:
-            self._graph.warn(f'{origin}: {problem}')
+        for warning in description.file_options.warnings:
+            self._graph.warn(f'{origin}: {warning}')
         self._graph.info(f'description from {origin}: a DLO of {description.length:.3g} m')
         self._report()
 
@@ -221,14 +212,14 @@ class PlannerSession(NodeSession[PlannerOptions]):
             self._take(event)
         if self._progress is not None and self._clock() - self._sent >= PROGRESS_PERIOD:
             self._send_progress()
-        self._tell_refusals()
+        self._report_refusals()
         self._report()
 
     def close(self) -> None:
         """End a plan under way, without publishing it."""
         self._background.stop()
         self._background.join(PATIENCE)
-        for text in self._situation.counted.rest():
+        for text in self._state.counted.rest():
             self._graph.warn(text)
 
     # Messages
@@ -287,7 +278,7 @@ class PlannerSession(NodeSession[PlannerOptions]):
 
         self._background.join()  # it has put its last event, so it ends now
         self._background.begin(work)
-        self._situation.state, self._situation.detail = PLANNING, FIRST
+        self._state.name, self._state.detail = PLANNING, FIRST
         self._frame_id, self.planning = start.frame_id, True
         self._plan, self._progress, self._plans = None, None, self._plans + 1
         self._back = None if pose is None else pose.inverse
@@ -310,8 +301,8 @@ class PlannerSession(NodeSession[PlannerOptions]):
     def _take(self, event: Event) -> None:
         if isinstance(event, PlanProgress):
             self._progress = event
-            if self._situation.detail == FIRST:
-                self._situation.detail = ''
+            if self._state.detail == FIRST:
+                self._state.detail = ''
         elif isinstance(event, Failure):
             self.planning = False
             self.fail(event.text, f'no plan: {event.text}', *filter(None, [event.details]))
@@ -334,10 +325,10 @@ class PlannerSession(NodeSession[PlannerOptions]):
             message = action_message(sent.actions[0].action.hands, stamp or NANOSECONDS, self._frame_id)
             self._send(ACTION, action_trajectory(self._types, message))
         detail = outcome(plan) if plan.reached else f'{outcome(plan)} The search: {plan.stop_reason}.'
-        self._situation.state, self._situation.detail, self._plan = DONE, detail, plan
+        self._state.name, self._state.detail, self._plan = DONE, detail, plan
         self._graph.info(f'plan {self._plans}: {detail}')
-        for remark in plan.warnings:
-            self._graph.warn(remark)
+        for warning in plan.warnings:
+            self._graph.warn(warning)
         self._report()
 
     # Messages of the node
@@ -349,13 +340,13 @@ class PlannerSession(NodeSession[PlannerOptions]):
 
     def _report(self) -> None:
         """Send the status if it differs from the last one."""
-        situation, missing = self._situation, self._missing()
-        detail = situation.detail
-        if situation.state == WAITING:
+        state, missing = self._state, self._missing()
+        detail = state.detail
+        if state.name == WAITING:
             detail = f'for {", ".join(f"~/{name}" for name in missing or ["plan"])}'
         content: dict[str, Any] = {
-            'state': situation.state, 'detail': detail, 'missing': ' '.join(missing),
-            'last_refusal': situation.last_refusal, 'description': self._origin, 'plans': self._plans}
+            'state': state.name, 'detail': detail, 'missing': ' '.join(missing),
+            'last_refusal': state.last_refusal, 'description': self._origin, 'plans': self._plans}
         # A stream that is refused changes its count with each message.
         if self._status_is_due(content, 'last_refusal'):
             self._send('status', planner_status(self._types, self._graph.stamp(), content, self._plan))
@@ -371,8 +362,9 @@ def _simulation(description: Description, options: PlannerOptions) -> Options:
     :raises InputError: if it has a scene that cannot be used.
     """
     replacing = options.replacing()
-    if description.refusal is not None and 'scene' not in replacing:
-        raise InputError(DESCRIPTION, f'a scene that cannot be used ({description.refusal.came})',
+    refusal = description.file_options.refusal
+    if refusal is not None and 'scene' not in replacing:
+        raise InputError(DESCRIPTION, f'a scene that cannot be used ({refusal.came})',
                          'one that can', 'set the parameter description to a result.xml beside its scene, '
                          "or 'scene=PATH' in the parameter simulation")
-    return Options.of({**description.options, **replacing})
+    return Options.of({**description.file_options.values, **replacing})

@@ -37,7 +37,7 @@ class Recorder:
         self._on_failure = on_failure
         self._reporter = ReportWriter(make_simulator)
         self._session: SessionWriter | None = None
-        self._missing: dict[Path, list[str]] = {}  # by the folder of a session that has not ended
+        self._missing: dict[Path, list[str]] = {}  # unwritten things, by the folder of an open session
         self._calibrated: SessionWriter | None = None  # the session of the calibration under way
         self._log: EvaluationLog | None = None
         self._written = False  # whether the result of the calibration is on the disk
@@ -110,7 +110,7 @@ class Recorder:
             self._write(SessionWriter.close, calibrated)
         log, self._log = self._log, None
         if log is not None:
-            with suppress(OSError):  # an old log harms nobody
+            with suppress(OSError):  # an old log does no harm
                 if not log.evaluations or self._written and not interrupted:
                     log.remove()
             log.close()

@@ -34,13 +34,12 @@ from dlo_calibration.messages.codec import (
 )
 from dlo_calibration.messages.collector import KEPT, StampOrder, TrialCollector, went_back
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.report import sentences
 from dlo_calibration.ros import diagnostics
 from dlo_calibration.ros.markers import alike, markers
 from dlo_calibration.ros.node_session import NodeInterface, NodeSession, NodeState, refusal_text
 from dlo_calibration.ros.recorder import Recorder
 from dlo_calibration.workspace.live_information import LiveInformation
-from dlo_calibration.workspace.worker import Failure, Notice, Progress, Worker
+from dlo_calibration.workspace.worker import CalibrationWarning, Failure, Progress, Worker
 
 
 @dataclass
@@ -80,7 +79,7 @@ class Dropped:
 
 
 @dataclass
-class Situation(NodeState):
+class SessionState(NodeState):
     """
     What a reset forgets, besides the trials.
 
@@ -88,10 +87,12 @@ class Situation(NodeState):
     :param heard: time of the last action or goal chain [s].
     :param started: whether a calibration was started, so that `start_after_trials` starts none.
     :param result: of the last calibration.
-    :param information: about the newest trial that was appraised.
+    :param information: what the newest trial adds.
+    :param markers: when to send the markers.
+    :param renewal: when to renew `information`.
     """
 
-    state: str = 'collecting'
+    name: str = 'collecting'
     refusals: deque[str] = field(default_factory=lambda: deque(maxlen=KEPT))
     heard: float = float('-inf')
     started: bool = False
@@ -99,7 +100,7 @@ class Situation(NodeState):
     information: TrialInformation | None = None
     dropped: Dropped = field(default_factory=Dropped)
     markers: Pace = field(default_factory=Pace)
-    appraisal: Pace = field(default_factory=Pace)
+    renewal: Pace = field(default_factory=Pace)
 
 
 @dataclass
@@ -107,13 +108,13 @@ class CalibrationUnderWay:
     """
     A calibration under way.
 
-    :param situation: of the session in which it started, which may have ended since.
+    :param state: of the session in which it started, which may have ended since.
     :param sent: time of its last progress message [s].
     """
 
     options: Options
     progress: Progress
-    situation: Situation
+    state: SessionState
     sent: float = float('-inf')
 
 
@@ -153,7 +154,7 @@ class Collecting:
 
 
 OF_CALIBRATION = ('progress', 'result', 'dlo_description')  # recorded in the session that was calibrated
-PROGRESS_PERIOD = 0.1  # s between two progress messages: nobody reads faster, and each is recorded
+PROGRESS_PERIOD = 0.1  # s between two progress messages, as each is recorded
 
 
 class Outlet:
@@ -190,15 +191,15 @@ class Outlet:
         self.send('dlo_description', self._types.build(
             OUTPUT_TYPES['dlo_description'], data=description_document(result, options.flat()).decode()))
 
-    def markers(self, situation: Situation, collector: TrialCollector, at_once: bool) -> None:
+    def markers(self, state: SessionState, collector: TrialCollector, at_once: bool) -> None:
         """Send the markers of all trials, unless the last ones show the same."""
         # Each message has the markers of all trials, and is recorded: the more trials, the fewer messages.
         now, period = self._clock(), 1.0 + 0.1 * collector.count
         if not at_once and not (
-                situation.markers.wanted and collector.count and now - situation.markers.last >= period):
+                state.markers.wanted and collector.count and now - state.markers.last >= period):
             return
-        situation.markers = Pace(last=now)
-        result, trials = situation.result, collector.trials
+        state.markers = Pace(last=now)
+        result, trials = state.result, collector.trials
         if trials and result is self._shown[0] and alike(trials, self._shown[1]):
             return
         self._shown = result, trials
@@ -224,20 +225,20 @@ class CalibrationSession(NodeSession[Options]):
 
     def __init__(self, graph: NodeInterface[Options], types: MessageTypes, make_simulator: SimulatorFactory,
                  clock: Callable[[], float] = time.monotonic) -> None:
-        super().__init__(graph, types, INPUT_TYPES, Situation(), clock)
-        self._situation: Situation
+        super().__init__(graph, types, INPUT_TYPES, SessionState(), clock)
+        self._state: SessionState
         self.requests = {'start': self._start, 'stop': self._stop, 'reset': self._reset,
                          'discard_last': self._discard_last}
         self._make_simulator = make_simulator
         self.collecting = Collecting(graph.options())
         self._worker = Worker(make_simulator)
-        self._appraiser = LiveInformation(make_simulator)
+        self._live_information = LiveInformation(make_simulator)
         self._recorder = Recorder(self._fail_to_record, make_simulator)
         self._outlet = Outlet(graph, types, self._recorder, clock)
         self._calibration: CalibrationUnderWay | None = None
         self._order = StampOrder()
         self._began = self._clock()
-        self.behind = False  # whether messages wait; appraisals and markers would delay them
+        self.behind = False  # whether messages wait; information and markers would delay them
         self._begin_recording()
         self._report()
 
@@ -256,7 +257,7 @@ class CalibrationSession(NodeSession[Options]):
 
         :param flush: False where `flush` follows soon.
         """
-        message, problem = self._read(kind, octets)
+        message, refusal = self._read(kind, octets)
         if message and self._order.clock_went_back(message):
             self._begin_anew(went_back(self._order.newest, message.stamp))
         if message and self._clock() - self._began < UNDER_WAY and self._order.left_over(message):
@@ -265,17 +266,17 @@ class CalibrationSession(NodeSession[Options]):
             return
         self._recorder.message(self._graph.topic(kind), INPUT_TYPES[kind], octets, flush)
         if kind != INITIAL:
-            self._situation.heard = self._clock()
-            self._situation.markers.wanted = self._situation.appraisal.wanted = True
-        problem = problem if message is None else self._collect(message)
-        if problem:
-            self.refuse(problem)
-        elif not self.calibrating and (self._situation.state != 'done' or kind != GOAL):  # a tracker goes on
-            self._situation.state, self._situation.detail = 'collecting', ''
+            self._state.heard = self._clock()
+            self._state.markers.wanted = self._state.renewal.wanted = True
+        refusal = refusal if message is None else self._collect(message)
+        if refusal:
+            self.refuse(refusal)
+        elif not self.calibrating and (self._state.name != 'done' or kind != GOAL):  # a tracker goes on
+            self._state.name, self._state.detail = 'collecting', ''
 
     def drop(self, counts: Mapping[str, int]) -> None:
         """Count messages that came and were dropped, by kind."""
-        self._situation.dropped.counts.update(counts)
+        self._state.dropped.counts.update(counts)
 
     def keep(self, kind: str, octets: bytes) -> None:
         """Record a message without collecting it, as the node ends."""
@@ -287,7 +288,7 @@ class CalibrationSession(NodeSession[Options]):
 
     def refuse(self, text: str) -> None:
         """Report a refusal as other sessions do, and remember it."""
-        self._situation.refusals.append(safe_line(text))
+        self._state.refusals.append(safe_line(text))
         super().refuse(text)
 
     def tick(self) -> None:
@@ -296,10 +297,10 @@ class CalibrationSession(NodeSession[Options]):
             self._show(at_once=False)
         self._take_events()
         self._recorder.report_failures()
-        self._tell_refusals()
-        self._tell_dropped()
+        self._report_refusals()
+        self._report_dropped()
         self._start_by_itself()
-        self._appraise()
+        self._renew_information()
         self._report()
 
     def change_options(self) -> None:
@@ -309,7 +310,7 @@ class CalibrationSession(NodeSession[Options]):
     def collect_anew(self) -> None:
         """Collect one message anew; new messages wait until `collecting.left` is 0."""
         if self.collecting.step():
-            self._tell_news()
+            self._report_news()
 
     def _take_options(self) -> Options:
         """Return the options in force, with which all messages so far are collected."""
@@ -321,13 +322,13 @@ class CalibrationSession(NodeSession[Options]):
     def close(self) -> None:
         """End the calibration, with its best evaluation so far as the result, then the recording."""
         self._worker.stop()
-        self._appraiser.stop()
+        self._live_information.stop()
         try:
-            self._tell_dropped(at_once=True)
-            if not (self._worker.join(PATIENCE) and self._appraiser.join(PATIENCE)):
+            self._report_dropped(at_once=True)
+            if not (self._worker.join(PATIENCE) and self._live_information.join(PATIENCE)):
                 self._graph.warn(f'a simulation did not end within {PATIENCE:.0f} s; it is abandoned')
             self._take_events()
-            self._warn(self._situation.counted.rest())
+            self._warn(self._state.counted.rest())
         finally:
             self._recorder.close()
 
@@ -346,16 +347,16 @@ class CalibrationSession(NodeSession[Options]):
             self._order.check(message)
             self._order.add(message)
             self._collector.add(message)
-            self._tell_news()
+            self._report_news()
         except Exception as error:
             return refusal_text(error, message.kind)
         return ''
 
-    def _tell_news(self) -> None:
+    def _report_news(self) -> None:
         for refusal in (*self._collector.take_refusals(), *self._collector.take_warnings()):
             self.refuse(str(refusal))
         for early in self._collector.take_early():
-            self._graph.info(f'{early.thing}: came before the first initial chain; not used')
+            self._graph.info(early)
 
     def clock_went_back(self, before: int, now: int) -> None:
         """Begin another session, as the node's clock went from one time [ns] back to another."""
@@ -366,7 +367,7 @@ class CalibrationSession(NodeSession[Options]):
     def _begin_anew(self, why: str) -> None:
         """Begin another session because the clock went back."""
         self._order, self._began = StampOrder(self._order), self._clock()
-        if self._situation.heard == float('-inf'):  # only initial chains came: there is no session to keep
+        if self._state.heard == float('-inf'):  # only initial chains came: there is no session to keep
             self.collecting = Collecting(self._graph.options())
             self._graph.warn(why)
             return
@@ -386,39 +387,40 @@ class CalibrationSession(NodeSession[Options]):
         self._require_idle('start')
         self._graph.hear_waiting()  # messages sent before the request belong to this calibration
         options = self._take_options()
-        known = set(self._situation.refusals)
-        for problem in self._collector.problems:
-            if str(problem) not in known:
-                self.refuse(str(problem))
+        reported = set(self._state.refusals)
+        for refusal in map(str, self._collector.refusals):
+            if refusal not in reported:
+                self.refuse(refusal)
         trials = self._collector.trials
         if not trials:
             lacks = self._collector.incomplete or 'an initial_chain, an action and a goal_chain'
             raise InputError('~/start', 'no complete trial', lacks, 'send it, then call ~/start again')
         self._make_simulator(options).close()  # raises here if the engine or the scene cannot be used
         log = self._recorder.start(trials, options)
-        situation = self._situation
+        state = self._state
         choice = choose(trials, options)
         progress = Progress(choice.options.evaluations, len(trials), log.evaluations if log else 0)
-        self._calibration = CalibrationUnderWay(options, progress, situation)
-        situation.started, situation.state, situation.detail = True, 'calibrating', log.resumed if log else ''
-        self._appraiser.stop()
-        situation.appraisal.wanted = True  # again after the calibration, as this one was stopped
+        self._calibration = CalibrationUnderWay(options, progress, state)
+        state.started, state.name, state.detail = True, 'calibrating', log.resumed if log else ''
+        self._live_information.stop()
+        state.renewal.wanted = True  # again after the calibration, as this one was stopped
         self._worker.start(trials, options, log)
         return ' '.join(filter(None, [
-            f'calibrating on {len(trials)} trial(s), {progress.evaluations} evaluations.', choice.words]))
+            f'calibrating on {len(trials)} trial(s), at most {progress.evaluations} evaluations.',
+            choice.words]))
 
     def _start_by_itself(self) -> None:
-        situation, wanted = self._situation, self._graph.options().start_after_trials
-        if self.calibrating or self.collecting.left or situation.started \
+        state, wanted = self._state, self._graph.options().start_after_trials
+        if self.calibrating or self.collecting.left or state.started \
                 or not 0 < wanted <= self._collector.count:
             return
         # A trial may have many goal chains: it is complete when the next trial begins, or no message follows.
-        if self._collector.count > wanted or self._clock() - situation.heard > QUIET:
-            situation.started = True
+        if self._collector.count > wanted or self._clock() - state.heard > QUIET:
+            state.started = True
             try:
                 self._graph.info(self._start())
             except InputError as error:
-                situation.state, situation.detail = 'failed', str(error)
+                state.name, state.detail = 'failed', str(error)
                 self.refuse(str(error))
 
     def _stop(self) -> str:
@@ -439,33 +441,33 @@ class CalibrationSession(NodeSession[Options]):
         self._take_options()
         before = self._collector.count
         self._recorder.taken_back(*self._collector.take_back())
-        situation, count = self._situation, self._collector.count
-        self._appraiser.stop()
-        situation.state, situation.detail, situation.information = 'collecting', '', None
-        situation.appraisal.wanted = True
+        state, count = self._state, self._collector.count
+        self._live_information.stop()
+        state.name, state.detail, state.information = 'collecting', '', None
+        state.renewal.wanted = True
         self._show()
         which = f'trial {before}' if count < before else 'the incomplete trial'
         return f'{which} is taken back; {count} trial(s) are left'
 
     def _forget(self) -> None:
         """Begin another session; a calibration under way goes on."""
-        self._tell_dropped(at_once=True)
+        self._report_dropped(at_once=True)
         self._recorder.end()
-        self._appraiser.stop()
+        self._live_information.stop()
         self.collecting = Collecting(self._graph.options())
-        self._warn(self._situation.counted.rest())
+        self._warn(self._state.counted.rest())
         self._status = {}  # the next one is about another session
-        self._situation = Situation('calibrating' if self.calibrating else 'collecting')
+        self._state = SessionState('calibrating' if self.calibrating else 'collecting')
         self._began = self._clock()
         self._begin_recording()
         self._show()
 
-    # Events of the worker, and appraisals of trials
+    # Events of the worker, and information about trials
 
     def _take_events(self) -> None:
         for event in self._worker.waiting_events():
-            if isinstance(event, Notice):
-                self._situation.detail = safe_line(event.text)
+            if isinstance(event, CalibrationWarning):
+                self._state.detail = safe_line(event.text)
                 self._graph.warn(event.text)
             elif not isinstance(event, Evaluation):
                 self._finish(event)
@@ -483,12 +485,12 @@ class CalibrationSession(NodeSession[Options]):
             self._recorder.finish(interrupted=True)
             self.fail(event.text, f'calibration failed: {event.text}', *filter(None, [event.details]))
             return
-        situation, options = self._situation, calibration.options
-        situation.state, situation.detail = 'done', f'{sentences.verdict(event)} {event.stop_reason}'
-        calibration.situation.result = event
-        if situation is not calibration.situation:
-            situation.detail += '; this is the result of the session before the clock went back'
-        (self._graph.warn if event.unusable else self._graph.info)(sentences.verdict(event))
+        state, options = self._state, calibration.options
+        state.name, state.detail = 'done', f'{event.headline} {event.stop_reason}'
+        calibration.state.result = event
+        if state is not calibration.state:
+            state.detail += '; this is the result of the session before the clock went back'
+        (self._graph.warn if event.unusable else self._graph.info)(event.headline)
         self._graph.info(diagnostics.in_one_line(event))
         for warning in event.warnings:
             self._graph.warn(warning)
@@ -496,43 +498,48 @@ class CalibrationSession(NodeSession[Options]):
         if older := self._recorder.result(event, options):
             self._graph.info(older)
         self._recorder.finish(interrupted=self._worker.stopped)
-        situation.markers = Pace(wanted=True)  # at the next tick
+        state.markers = Pace(wanted=True)  # at the next tick
         self._report()
 
-    def _appraise(self) -> None:
-        """Take finished appraisals; start one if trials have changed and no calibration is under way."""
-        situation, now = self._situation, self._clock()
-        for information in self._appraiser.waiting_information():
-            situation.information = information
-        quiet = now - situation.heard > QUIET
-        # While messages keep coming, an appraisal every two seconds leaves the processor to other programs.
-        if situation.appraisal.wanted and not self.behind and not self.calibrating and self._collector.count \
-                and not self._appraiser.alive \
-                and (quiet or now - situation.appraisal.last > 2.0):
-            situation.appraisal = Pace(wanted=not quiet, last=now)
-            self._appraiser.start(self._collector.trials, self._graph.options(), situation.result, quiet)
+    def _renew_information(self) -> None:
+        """Take new information; begin to renew it if trials have changed and no calibration is under way."""
+        state, now = self._state, self._clock()
+        for information in self._live_information.waiting_information():
+            if self._is_about_newest(information):
+                state.information = information
+        quiet = now - state.heard > QUIET
+        # While messages keep coming, a renewal every two seconds leaves the processor to other programs.
+        if state.renewal.wanted and not self.behind and not self.calibrating and self._collector.count \
+                and not self._live_information.alive \
+                and (quiet or now - state.renewal.last > 2.0):
+            state.renewal = Pace(wanted=not quiet, last=now)
+            self._live_information.start(self._collector.trials, self._graph.options(), state.result, quiet)
+
+    def _is_about_newest(self, information: TrialInformation | None) -> bool:
+        """Tell whether information is about the newest trial; which others may follow."""
+        return information is not None and information.trial == f'trial {self._collector.count}'
 
     # Messages of the node
 
-    def _tell_dropped(self, at_once: bool = False) -> None:
+    def _report_dropped(self, at_once: bool = False) -> None:
         """Warn of dropped messages if there are new ones, at most once a second."""
-        if texts := self._situation.dropped.due(self._clock(), at_once):
+        if texts := self._state.dropped.due(self._clock(), at_once):
             self._warn(texts)
-            self._recorder.dropped(self._situation.dropped.reported)
+            self._recorder.dropped(self._state.dropped.reported)
 
     def _report(self) -> None:
         """Send the status if it differs from the last one."""
-        situation, collector = self._situation, self._collector
+        state, collector = self._state, self._collector
         content: dict[str, Any] = {
-            'state': situation.state, 'trials': collector.count, 'last_refusal': situation.last_refusal,
-            'incomplete': collector.incomplete, 'detail': ANEW if self.collecting.left else situation.detail,
-            'dropped': situation.dropped.reported.total()}
-        about = situation.information
+            'state': state.name, 'trials': collector.count, 'last_refusal': state.last_refusal,
+            'incomplete': collector.incomplete, 'detail': ANEW if self.collecting.left else state.detail,
+            'dropped': state.dropped.reported.total()}
+        about = state.information if self._is_about_newest(state.information) else None
         if self._status_is_due({**content, 'about': about}, 'last_refusal', 'incomplete', 'dropped'):
             self._outlet.send('status', diagnostics.status(self._types, self._graph.stamp(), content, about))
 
     def _show(self, at_once: bool = True) -> None:
-        self._outlet.markers(self._situation, self._collector, at_once)
+        self._outlet.markers(self._state, self._collector, at_once)
 
     def _begin_recording(self) -> None:
         self._recorder.begin(self._graph.options())
@@ -540,6 +547,6 @@ class CalibrationSession(NodeSession[Options]):
             self._graph.info(f'recording to {self._recorder.folder}')
 
     def _fail_to_record(self, text: str) -> None:
-        self._situation.last_refusal = text
+        self._state.last_refusal = text
         self._graph.error(text)
         self._report()

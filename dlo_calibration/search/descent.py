@@ -16,6 +16,8 @@ from dlo_calibration.evaluation.residuals import Huber
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.search.protocol import Observation
 
+#: Largest distance, in each parameter, at which a Jacobian is still valid and two minima count as the same.
+NEAR = 0.03
 STEEP = 1e-12  # share of the largest possible slope that counts as none
 
 
@@ -45,7 +47,7 @@ def bounded_least_squares(matrix: Floats, right: Floats, least: Floats, most: Fl
 
 def _solved(matrix: Floats, right: Floats, least: Floats, most: Floats, x: Floats, free: NDArray[np.bool_]
             ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return the best x in which only free unknowns change; those that come to a bound stay there."""
+    """Return the best x that changes only free unknowns; those that reach a bound stay there."""
     x, free = x.copy(), free.copy()
     while free.any():
         there = np.linalg.lstsq(matrix[:, free], right - matrix[:, ~free] @ x[~free], rcond=None)[0]
@@ -62,9 +64,6 @@ def _solved(matrix: Floats, right: Floats, least: Floats, most: Floats, x: Float
         x[columns[first]] = bound[first]
         free[columns[first]] = False
     return x, free
-
-#: Largest distance, in each parameter, at which a Jacobian is still valid and two minima count as the same.
-NEAR = 0.03
 
 
 @dataclass
@@ -123,8 +122,7 @@ class Descent:
     def visible(self) -> NDArray[np.bool_]:
         """Return (d,) True where the whole range of a parameter changes the residuals visibly."""
         size = np.linalg.norm(self.jacobian, axis=0)
-        visible: NDArray[np.bool_] = size > max(self.loss.threshold, 1e-9 * float(size.max(initial=0.0)))
-        return visible
+        return np.asarray(size > max(self.loss.threshold, 1e-9 * float(size.max(initial=0.0))))
 
     def step(self, radius: float) -> Floats:
         """Return the (d,) step that minimises the model within the unit cube and the radius."""

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Generator, Sequence
+from typing import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,8 @@ COARSE_GAIN = 0.01  # the same for a coarse search: cross-validation would not n
 SCAN_RADIUS = 0.1  # of a step from a scanned point; points nearer than this to the minimum are not scanned
 MOST_ITERATIONS = 25  # of one descent
 STALLED = 0.02  # share of the cost; a descent had stalled before its minimum if polishing saves more
-MOST_RESUMED = 4  # times that a descent goes on after it was polished
+MOST_RESUMED = 4  # times that a polished descent continues
+CONFIRMED = 2  # independent descents that end in a minimum, or find none lower, confirm it
 
 
 def costs_less(residuals: Floats, others: Floats) -> bool:
@@ -54,8 +55,8 @@ class LeastSquares(Search):
 
     def __init__(self, dimension: int, seed: int, hints: Hints | None = None) -> None:
         super().__init__(dimension, seed, hints)
-        # [m] root mean square change of the residuals over the whole range of each parameter.  The smallest
-        # one measured is kept: contacts that come and go make columns too large, never too small.
+        # [m] root mean square change of the residuals over the whole range of each parameter: the smallest
+        # one measured, as contacts that come and go make columns too large, never too small.
         self._least_effect = np.full(dimension, np.inf)
         self._descents: list[Descent] = []
 
@@ -76,50 +77,62 @@ class LeastSquares(Search):
         return observation.residuals is not None and (
             lowest is None or costs_less(observation.residuals, lowest))
 
-    def _batches(self) -> Batches:
-        """Follow descents from the start points, lowest cost first, until the lowest minimum is confirmed."""
+    def _batches(self) -> Batches[str]:
+        """Descend from the best start point, then confirm and polish the minimum."""
         starts = yield from self._starts()
         narrowest = min(Huber.of(start.residuals) for start in starts if start.residuals is not None)
         starts.sort(key=lambda start: narrowest.cost(start.residuals))
-        best = yield from self._descend(self._begin(starts.pop(0)), None, starts)
-        beyond: list[Descent] = []
-        reached, checks, scanned = 1, 0, False  # descents that ended in the best minimum; that checked it
-        while reached < 2 and checks < 2 and not self._hints.refines:
+        best, reached = (yield from self._descend(self._begin(starts.pop(0)), None, starts)), 1
+        if not self._hints.refines:
+            best, reached = yield from self._confirm(best, starts)
+        best = yield from self._end(best)
+        if self._hints.jacobian is None:
+            polished = yield from self._finish(best)
+            best, reached = polished, reached if self._same_minimum(polished, best) else 1
+        return best.ended + (f'; reached from {reached} starts' if reached > 1 else '')
+
+    def _confirm(self, best: Descent, starts: list[Observation]) -> Batches[tuple[Descent, int]]:
+        """
+        Descend from other start points until the lowest minimum is confirmed.
+
+        :returns: the descent that ended there, and the number of start points that led there.
+        """
+        reached, checks, scanned = 1, 0, False  # checks: descents that began after the best one had ended
+        while reached < CONFIRMED and checks < CONFIRMED:
             starts = [start for start in starts if np.abs(start.point - best.point).max() > NEAR]
-            if not best.ended and not best.has_rival(starts):
-                best = yield from self._descend(best, None, ())
+            if not best.has_rival(starts):
+                best = yield from self._end(best)
+            beyond: Descent | None = None
             if best.ended:
                 self._to_lowest(best)
                 if not scanned:
-                    beyond = yield from self._scan(best)
-                    scanned = True
-            if not (beyond or starts):
+                    beyond, scanned = (yield from self._scan(best)), True
+            if beyond is None and not starts:
                 break
-            independent = not beyond
-            begun = beyond.pop() if beyond else self._begin(starts.pop(0))
-            checks += independent and bool(best.ended)
-            descent = yield from self._descend(begun, best, starts)
-            same, better = self._same_minimum(descent, best), costs_less(descent.residuals, best.residuals)
-            reached = reached + independent if same else 1 if better else reached
-            if better:
-                best = descent
-        if not best.ended:
-            best = yield from self._descend(best, None, ())
-        if not scanned and not self._hints.refines:
+            checks += beyond is None and bool(best.ended)
+            descent = yield from self._descend(beyond or self._begin(starts.pop(0)), best, starts)
+            better = costs_less(descent.residuals, best.residuals)
+            if self._same_minimum(descent, best):
+                reached += beyond is None
+            elif better:
+                reached = 1
+            best = descent if better else best
+        best = yield from self._end(best)
+        if not scanned:
             self._to_lowest(best)
-            for begun in (yield from self._scan(best)):
-                descent = yield from self._descend(begun, best, ())
+            beyond = yield from self._scan(best)
+            if beyond is not None:
+                descent = yield from self._descend(beyond, best, ())
                 if costs_less(descent.residuals, best.residuals):
-                    best, reached = descent, 1
-            if not best.ended:
-                best = yield from self._descend(best, None, ())
-        if self._hints.jacobian is None:
-            last = yield from self._finish(best)
-            best, reached = last, reached if self._same_minimum(last, best) else 1
-        return best.ended + (f'; reached from {reached} starts' if reached > 1 else '')
+                    best, reached = (yield from self._end(descent)), 1
+        return best, reached
 
-    def _finish(self, best: Descent) -> Generator[Floats, Sequence[Observation], Descent]:
-        """Polish a minimum; if that saves much, the descent had stalled in a rough valley, and goes on."""
+    def _end(self, descent: Descent) -> Batches[Descent]:
+        """Continue a descent, without rivals, until it ends."""
+        return descent if descent.ended else (yield from self._descend(descent, None, ()))
+
+    def _finish(self, best: Descent) -> Batches[Descent]:
+        """Polish a minimum; after a large gain, the descent had stalled in a rough valley, and continues."""
         for _ in range(MOST_RESUMED):
             polished = yield from self._polish(best)
             self._descents.append(polished)
@@ -128,10 +141,10 @@ class LeastSquares(Search):
             if not stalled:
                 break
             best.ended = ''
-            best = yield from self._descend(best, None, ())
+            best = yield from self._end(best)
         return best
 
-    def _polish(self, here: Descent) -> Generator[Floats, Sequence[Observation], Descent]:
+    def _polish(self, here: Descent) -> Batches[Descent]:
         """
         Improve a minimum with wide differences, which kinks of the residuals disturb less than narrow ones.
 
@@ -168,35 +181,35 @@ class LeastSquares(Search):
         if self._hints.jacobian is not None and np.array_equal(start.point, np.clip(self._hints.start, 0, 1)):
             begun.jacobian, begun.moves = self._hints.jacobian, 1
             begun.origin = np.full(self._dimension, np.inf)  # not fresh, as it is not quite that of here
-            self._note_effects(begun)
+            self._update_effects(begun)
         return begun
 
-    def _scan(self, here: Descent) -> Generator[Floats, Sequence[Observation], list[Descent]]:
+    def _scan(self, here: Descent) -> Batches[Descent | None]:
         """
         Scan the range of the parameter of least effect, along which minima often lie side by side.
 
-        :returns: a descent at the best scanned point, if its predicted cost is at least 2 % lower; else none.
+        :returns: a descent at the best scanned point, if its predicted cost is at least 2 % lower; else None.
         """
         free = np.flatnonzero(here.visible())
         if not len(free):
-            return []
+            return None
         weakest = free[np.argmin(self._least_effect[free])]
         values = np.array([value for value in (0.1, 0.3, 0.5, 0.7, 0.9)
                            if abs(value - here.point[weakest]) > SCAN_RADIUS])
         points = np.tile(here.point, (len(values), 1))
         points[:, weakest] = values
         observations = yield points
-        promising = []
+        lowest, best = (1 - 0.02) * here.cost, None
         for observation in observations:
             if observation.residuals is not None:
                 there = Descent(observation.point, observation.residuals, here.loss, here.jacobian, NEAR,
                                 origin=here.origin)
-                predicted = there.predicted(there.step(SCAN_RADIUS))
-                promising.append((min(predicted, there.cost), there))
-        promising.sort(key=lambda pair: pair[0])
-        return [there for predicted, there in promising[:1] if predicted < (1 - 0.02) * here.cost]
+                predicted = min(there.predicted(there.step(SCAN_RADIUS)), there.cost)
+                if predicted < lowest:
+                    lowest, best = predicted, there
+        return best
 
-    def _starts(self) -> Generator[Floats, Sequence[Observation], list[Observation]]:
+    def _starts(self) -> Batches[list[Observation]]:
         """Ask for start points until at least one can be simulated."""
         # Two per parameter and at least eight; a Sobol sequence is balanced only for powers of two.
         count = 2 ** int(np.ceil(np.log2(max(8, 2 * self._dimension))))
@@ -223,8 +236,8 @@ class LeastSquares(Search):
         loss = min(descent.loss, other.loss)
         costs = loss.cost(descent.residuals), loss.cost(other.residuals)
         both = descent.visible() & other.visible()
-        apart = np.abs(descent.point - other.point)[both].max(initial=0.0)
-        return bool(apart < NEAR or abs(costs[0] - costs[1]) <= 1e-3 * max(costs))
+        distance = np.abs(descent.point - other.point)[both].max(initial=0.0)
+        return bool(distance < NEAR or abs(costs[0] - costs[1]) <= 1e-3 * max(costs))
 
     def _to_lowest(self, descent: Descent) -> None:
         """Move to the lowest point of all descents, if it is near."""
@@ -232,13 +245,13 @@ class LeastSquares(Search):
         if lowest is not None and np.abs(lowest.point - descent.point).max() <= NEAR:
             descent.move(lowest)
 
-    def _descend(self, here: Descent, known: Descent | None, rivals: Sequence[Observation]
-                 ) -> Generator[Floats, Sequence[Observation], Descent]:
+    def _descend(self, here: Descent, minimum: Descent | None, rivals: Sequence[Observation]
+                 ) -> Batches[Descent]:
         """
         Continue a descent until it ends or is given up; `ended` stays empty when it is given up.
 
-        It is given up where it leads to the `known` minimum or to a higher one, or where it is
-        slow and one of the start points `rivals` is as promising.
+        It is given up if it leads to `minimum`, the best one so far, or to a higher one, or if it is slow
+        and one of the start points `rivals` is as promising.
         """
         self._descents = [descent for descent in self._descents if descent is not here] + [here]
         slow = 0
@@ -248,7 +261,7 @@ class LeastSquares(Search):
             step = here.step(np.inf)
             gain = here.cost - here.predicted(step)
             length = float(np.abs(step).max(initial=0.0))
-            if known is not None and self._leads_nowhere(here, step, known):
+            if minimum is not None and self._leads_nowhere(here, step, minimum):
                 return here
             # Where the residuals are rough, a gain below a tenth of their relative roughness is chance.
             least = max(COARSE_GAIN if self._hints.coarse else DONE_GAIN,
@@ -270,7 +283,7 @@ class LeastSquares(Search):
                 here.ended = f'converged: the last step lowered the cost by less than {least * 100:.2g} %'
                 return here
             slow = slow + 1 if gained < 0.2 else 0  # consecutive steps of little gain
-            if slow and known is not None and known.loss.cost(here.residuals) > 2 * known.cost:
+            if slow and minimum is not None and minimum.loss.cost(here.residuals) > 2 * minimum.cost:
                 return here
             if slow > 1 and here.has_rival(rivals):
                 return here
@@ -280,17 +293,17 @@ class LeastSquares(Search):
         return here
 
     @staticmethod
-    def _leads_nowhere(here: Descent, step: Floats, known: Descent) -> bool:
-        """Tell whether a descent approaches the known minimum, or flattens out at a higher cost."""
+    def _leads_nowhere(here: Descent, step: Floats, minimum: Descent) -> bool:
+        """Tell whether a descent approaches a minimum, or flattens out at a higher cost."""
         target = here.point + step
-        both = here.visible() & known.visible()
-        near = np.abs(target - known.point)[both].max(initial=0.0) < NEAR and (
-            np.abs(here.point - known.point)[both].max(initial=0.0) < 2 * NEAR)
-        higher = known.loss.cost(here.residuals) > known.cost
+        both = here.visible() & minimum.visible()
+        near = np.abs(target - minimum.point)[both].max(initial=0.0) < NEAR and (
+            np.abs(here.point - minimum.point)[both].max(initial=0.0) < 2 * NEAR)
+        higher = minimum.loss.cost(here.residuals) > minimum.cost
         flat = float(np.abs(step).max(initial=0.0)) < NEAR / 3
         return bool(higher and (near or flat))
 
-    def _try(self, here: Descent) -> Generator[Floats, Sequence[Observation], bool]:
+    def _try(self, here: Descent) -> Batches[bool]:
         """Try the step within the radius and a shorter one; move to the better one if it lowers the cost."""
         steps = [here.step(here.radius)]
         shorter = here.step(here.radius * SHORTER)
@@ -313,13 +326,12 @@ class LeastSquares(Search):
         else:
             here.radius = min(float(np.abs(step).max()) for step in steps) / 4
         # The longest step comes last: the updated Jacobian then predicts it exactly.
-        for observation in sorted(observations, key=lambda one: float(np.linalg.norm(one.point - base))):
+        for observation in sorted(observations, key=lambda each: float(np.linalg.norm(each.point - base))):
             here.update_jacobian(observation, base, before)
         here.moves += moved
         return moved
 
-    def _measure(self, here: Descent, columns: NDArray[np.intp]
-                 ) -> Generator[Floats, Sequence[Observation], None]:
+    def _measure(self, here: Descent, columns: NDArray[np.intp]) -> Batches[None]:
         """
         Measure columns of the Jacobian by finite differences; move to the best point if it costs less.
 
@@ -340,14 +352,14 @@ class LeastSquares(Search):
             residuals = [observation.residuals for observation in batch]
             here.jacobian = jacobian = sides.jacobian(jacobian, residuals, here.residuals)
             beside.extend(batch)
-            columns = columns[[one is None for one in residuals]]
+            columns = columns[[each is None for each in residuals]]
             sizes = -sizes / 2
-        self._note_effects(here)
+        self._update_effects(here)
         best = min(beside, key=lambda observation: here.loss.cost(observation.residuals), default=None)
         if best is not None and here.loss.cost(best.residuals) < here.cost:
             here.move(best)
 
-    def _note_effects(self, here: Descent) -> None:
+    def _update_effects(self, here: Descent) -> None:
         effect = np.sqrt(np.mean(here.jacobian ** 2, axis=0))
         self._least_effect = np.where(effect > 0, np.minimum(self._least_effect, effect), self._least_effect)
 

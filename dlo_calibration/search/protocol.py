@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Generator, Sequence
+from typing import Generator, Sequence, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,13 +34,13 @@ class Observation:
 @dataclass(frozen=True)
 class Hints:
     """
-    What is known before the first evaluation, in the unit cube of d parameters.
+    The prior knowledge of a search, in the unit cube of d parameters.
 
     :param start: (d,) prior estimate; nan where there is none.
     :param excited: (d,) False where no trial can show the effect of a parameter.
     :param refines: `start` is the result for a simpler model, so that the search starts only there.
-    :param jacobian: (m, d) of the residuals at `start` [m per unit cube], if it is known already.
-    :param coarse: the search ends where a step gains little, before it has quite converged.
+    :param jacobian: (m, d) of the residuals at `start` [m per unit cube]; None: unknown.
+    :param coarse: the search ends where a step gains little, before it has converged.
     """
 
     start: Floats
@@ -64,8 +64,9 @@ class Hints:
         return cls(start, np.ones(len(start), np.bool_), True, jacobian, coarse)
 
 
-#: It yields (m, d) points, receives their m observations, and returns why it finished, in words.
-Batches = Generator[Floats, Sequence[Observation], str]
+Result = TypeVar('Result')
+#: It yields (m, d) points, receives their m observations, and returns a result.
+Batches = Generator[Floats, Sequence[Observation], Result]
 
 
 class Search:
@@ -77,7 +78,7 @@ class Search:
 
     :param dimension: number of parameters.
     :param seed: of the method's random numbers.
-    :param hints: what is known before the first evaluation; None: nothing.
+    :param hints: prior knowledge; None: none.
     """
 
     name: str
@@ -86,12 +87,13 @@ class Search:
         self._dimension, self._seed = dimension, seed
         self._hints = Hints.none(dimension) if hints is None else hints
         self._lowest: Observation | None = None
-        self._under_way: Batches | None = None
+        self._under_way: Batches[str] | None = None
         self._batch: Floats = np.zeros((0, dimension))
         self._observations: list[Observation] = []  # of the first points of the batch
         self.stop_reason = ''  # why the method ended, in words; empty until then
 
-    def _batches(self) -> Batches:
+    def _batches(self) -> Batches[str]:
+        """Yield batches of points; return why the method ended, in words."""
         raise NotImplementedError
 
     def _improves(self, observation: Observation) -> bool:

@@ -19,7 +19,7 @@ class RandomSearch(Search):
 
     name = 'random'
 
-    def _batches(self) -> Batches:
+    def _batches(self) -> Batches[str]:
         generator = np.random.default_rng(self._seed)
         while True:
             yield generator.random((BATCH, self._dimension))
@@ -35,7 +35,7 @@ class CmaEs(Search):
 
     name = 'cma_es'
 
-    def _batches(self) -> Batches:
+    def _batches(self) -> Batches[str]:
         try:
             import cma
         except ImportError as error:
@@ -52,7 +52,7 @@ class CmaEs(Search):
         while not strategy.stop():
             points = np.clip(strategy.ask(), 0.0, 1.0)
             observations = yield points
-            scores = np.array([one.score for one in observations])
+            scores = np.array([observation.score for observation in observations])
             good = np.isfinite(scores)
             if not good.any():
                 continue  # all failed: ask for another sample of the same distribution

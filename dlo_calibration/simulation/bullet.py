@@ -4,9 +4,9 @@
 """
 The PyBullet engine: a rope for any PyBullet world, and a simulator of trials that uses it.
 
-The rope's nodes are spheres.  In each step, the core computes their velocities from
-internal forces, gravity and the rope's contact with itself; Bullet adds contact and
-friction with all other bodies: a table, obstacles, robots.  A robot's gripper can hold the rope.
+The rope's nodes are spheres.  In each step, the core computes their velocities due to
+internal forces, gravity and self-contact; Bullet adds contact and friction with all
+other bodies: a table, obstacles, robots.  A robot's gripper can hold the rope.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.parameters import GRAVITY
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.simulation import core
-from dlo_calibration.simulation.compiled import Engine
+from dlo_calibration.simulation.compiled import Engine, NO_TABLE
 from dlo_calibration.simulation.nodes import feature_shares, NodeLayout, spread_places
 from dlo_calibration.simulation.protocol import DEFAULT_NODES, Rollout
 from dlo_calibration.simulation.scene import Obstacle, read_scene, stl_octets
@@ -36,20 +36,20 @@ def _silence() -> Iterator[None]:
     """Keep native code from writing to stdout and stderr."""
     flush = ctypes.CDLL(None).fflush  # of C, which buffers output to a pipe
     flush(None)
-    kept, nowhere = (os.dup(1), os.dup(2)), os.open(os.devnull, os.O_WRONLY)
+    saved, nowhere = (os.dup(1), os.dup(2)), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
     os.dup2(nowhere, 2)
     try:
         yield
     finally:
         flush(None)
-        for stream, before in enumerate(kept, 1):
-            os.dup2(before, stream)
-            os.close(before)
+        for stream, copy in enumerate(saved, 1):
+            os.dup2(copy, stream)
+            os.close(copy)
         os.close(nowhere)
 
 
-with _silence():  # at import it prints its build time, also in the middle of a progress bar
+with _silence():  # its import prints the build time, which would disturb a progress bar
     import pybullet as pybullet  # so that others can use it
 
 
@@ -79,9 +79,9 @@ def add_obstacle(client: int, obstacle: Obstacle) -> None:
 @contextmanager
 def _file_of(triangles: Floats) -> Iterator[str]:
     """
-    Give the path of a file with checked triangles, for a while; empty if there are none.
+    Give the path of a temporary file with triangles, or '' if there are none.
 
-    PyBullet takes arrays, too, but does not free them with the world.
+    PyBullet also takes arrays, but does not free them with the world.
     """
     if not len(triangles):
         yield ''
@@ -116,15 +116,15 @@ class Gripper:
         #: indices of the nodes that it holds
         self.nodes: tuple[int, ...] = ()
 
-    def close(self, points: Floats, taken: Sequence[int], count: int, reach: float) -> None:
+    def close(self, points: Floats, held: Sequence[int], count: int, reach: float) -> None:
         """
-        Hold the nodes next to the place, where they are.
+        Hold the nodes next to the place, at their positions.
 
         :param points: (N, 3) [m] all nodes of the rope.
-        :param taken: indices of nodes that something else holds.
+        :param held: indices of nodes that are already held.
         :param count: number of neighbouring nodes to hold.
         :param reach: largest distance [m] of the rope from the place.
-        :raises InputError: if the rope is further away, or if there something else holds it.
+        :raises InputError: if the rope is further away, or already held there.
         """
         position, self.turn = self._pose()
         centre = position + self.turn @ self._place
@@ -133,42 +133,44 @@ class Gripper:
         shares = np.clip(along, 0.0, 1.0)
         distances = np.linalg.norm(points[:-1] + shares[:, None] * segments - centre, axis=1)
         nearest = int(distances.argmin())
-        what = f'the gripper at link {self.link} of body {self.body}'
+        gripper = f'the gripper at link {self.link} of body {self.body}'
         if not distances[nearest] <= reach:
-            raise InputError(what, f'a rope that is {1000 * distances[nearest]:.0f} mm away from it',
+            raise InputError(gripper, f'a rope that is {1000 * distances[nearest]:.0f} mm away from it',
                              f'at most {1000 * reach:.0f} mm',
                              'move the gripper to the rope, or give the place between its fingers')
         first = round(nearest + float(shares[nearest]) - (count - 1) / 2)
         first = min(max(first, 0), len(points) - count)
-        self.nodes = tuple(node for node in range(first, first + count) if node not in taken)
+        self.nodes = tuple(node for node in range(first, first + count) if node not in held)
         if not self.nodes:
-            raise InputError(what, 'nodes that are held already', 'free ones', 'release them first')
+            raise InputError(gripper, 'nodes that are held already', 'free ones', 'release them first')
         self._offsets = (points[list(self.nodes)] - position) @ self.turn
 
     def follow(self) -> tuple[Floats, Floats]:
         """Return positions of the nodes now, (n, 3) [m], and the rotation (3, 3) since the last call."""
         position, turn = self._pose()
-        since = turn @ self.turn.T
+        rotation = turn @ self.turn.T
         self.turn = turn
-        return position + self._offsets @ turn.T, since
+        return position + self._offsets @ turn.T, rotation
 
-    def touch(self, nodes: Sequence[int], touches: bool) -> None:
+    def set_contact(self, bodies: Sequence[int], enabled: bool) -> None:
         """
-        Say whether the hand, i.e. the link with all that is fixed to it or moved by it, touches bodies.
+        Enable or disable contact of the hand with bodies.
 
-        :param nodes: ids of the bodies.
+        The hand is the link with all links that are fixed to it or that it moves.
+
+        :param bodies: their ids.
         """
         for link in self._hand:
-            for node in nodes:
-                pybullet.setCollisionFilterPair(self.body, node, link, -1, touches,
+            for body in bodies:
+                pybullet.setCollisionFilterPair(self.body, body, link, -1, enabled,
                                                 physicsClientId=self._client)
 
     def shares_links_with(self, other: Gripper) -> bool:
-        """Tell whether a link belongs to the hands of both."""
+        """Return whether the hands of both have a link in common."""
         return self.body == other.body and not set(self._hand).isdisjoint(other._hand)
 
     def is_clear_of(self, points: Floats, radius: float) -> bool:
-        """Tell whether spheres at (N, 3) [m] are outside of the boxes around the links of the hand."""
+        """Return whether spheres at (N, 3) [m] are outside of the boxes around the links of the hand."""
         for link in self._hand:
             low, high = pybullet.getAABB(self.body, link, physicsClientId=self._client)
             outside = (points < np.array(low) - radius) | (points > np.array(high) + radius)
@@ -191,14 +193,14 @@ class Gripper:
 
 
 def _hand(client: int, body: int, link: int) -> tuple[int, ...]:
-    """Return the links that collide, of a link, of those that are fixed to it, and of all that these move."""
+    """Return the links of a hand that have a collision shape; see `Gripper.set_contact`."""
     joints = [pybullet.getJointInfo(body, k, physicsClientId=client)
               for k in range(pybullet.getNumJoints(body, physicsClientId=client))]
     parents = [joint[16] for joint in joints]
     while link >= 0 and joints[link][2] == pybullet.JOINT_FIXED:
         link = parents[link]
     hand = {link}
-    for k, parent in enumerate(parents):  # which has a smaller index than its children
+    for k, parent in enumerate(parents):  # a parent has a smaller index than its children
         if parent in hand:
             hand.add(k)
     return tuple(link for link in sorted(hand)
@@ -206,17 +208,16 @@ def _hand(client: int, body: int, link: int) -> tuple[int, ...]:
 
 
 IDENTITY = (0.0, 0.0, 0.0, 1.0)  # quaternion x y z w of no rotation
-NO_TABLE = -1e6  # m; the core's own table is so low that no node touches it
 
 
 class BulletRope:
     """
     A calibrated rope in a PyBullet world, beside robots and obstacles.
 
-    The world's own gravity and time step apply to it.  Friction with another
-    body is the product of both coefficients in Bullet: give the table of the
-    calibration `lateralFriction` 1.  Call `step` in place of
-    `pybullet.stepSimulation`, or `before_step` and `after_step` around it.
+    The world's gravity and time step apply to it.  In Bullet, friction with another
+    body is the product of both coefficients: give the table of the calibration
+    `lateralFriction` 1.  Call `step` instead of `pybullet.stepSimulation`, or
+    `before_step` and `after_step` around it.
 
     :param client: id of the PyBullet client.
     :param places: (N,) [m] arc lengths of the nodes at rest, from 0, increasing.
@@ -225,10 +226,10 @@ class BulletRope:
     :param radius: [m] for contact with other bodies; None: the self-collision radius.
     :param velocities: (N, 3) [m/s] at the start; None: at rest.
     :param features: (N,) number of points annotated as feature at each node; None: there are none.
-    :param directions: (N - 1, 3) unit vectors across the segments in clamps that hold from the start, to
-        which the rest shape belongs, nan elsewhere; None: unknown.
-    :param group: collision group, one bit; its bodies do not touch each other in Bullet.  Two
-        ropes that should touch each other need different groups.
+    :param directions: (N - 1, 3) unit vectors across the segments in clamps that hold from the start, from
+        which the rest shape is measured, nan elsewhere; None: unknown.
+    :param group: collision group, one bit; its bodies do not touch each other in Bullet.  Ropes
+        that may touch each other need different groups.
     """
 
     def __init__(self, client: int, places: Floats, points: Floats, physical: Mapping[str, float], *,
@@ -252,7 +253,7 @@ class BulletRope:
             pybullet.setCollisionFilterGroupMask(body, -1, group, ~group, physicsClientId=client)
         self._held: tuple[int, ...] = ()
         self._grippers: list[Gripper] = []
-        self._leaving: list[Gripper] = []  # that have opened, and may still be around the rope
+        self._leaving: list[Gripper] = []  # have opened, and may still be around the rope
         velocities = np.zeros((len(places), 3)) if velocities is None else velocities
         self.begin(core.Start(places, points, velocities, features, directions), physical)
 
@@ -265,7 +266,7 @@ class BulletRope:
         return cls(client, places, chain.resample(places), physical, **rest)
 
     def begin(self, start: core.Start, physical: Mapping[str, float]) -> None:
-        """Start again at a start of as many nodes, with other properties, but with the same bodies."""
+        """Restart with the same bodies at a start with the same number of nodes, and other properties."""
         self._rope = core.Rope(start, physical, self.time_step, NO_TABLE, self._gravity)
         self._held = ()
         self.release()
@@ -283,27 +284,27 @@ class BulletRope:
 
     def follow(self, script: core.Script) -> tuple[Floats, tuple[bool, ...], int] | None:
         """
-        Follow a script of a trial at whose start the rope is; None if the rollout diverges.
+        Follow the script of a trial from its start; return the outcome as `core.roll_out` does.
 
-        :raises SimulationError: if the rollout diverges.
+        :raises SimulationError: if velocities are not finite.
         """
         return self._rope.follow(script, self._take_step)
 
     @property
     def points(self) -> Floats:
-        """The nodes' positions now, (N, 3) [m]; a copy."""
+        """The nodes' current positions, (N, 3) [m]; a copy."""
         return self._rope.points.copy()
 
     def hold(self, nodes: Sequence[int]) -> None:
         """
-        Hold exactly these nodes from now on, besides those in grippers; an empty sequence lets go of them.
+        Hold exactly these nodes from now on, besides those in grippers; an empty sequence releases them.
 
-        They still touch whatever is there.  For a robot that holds the rope, `grip` is better.
+        They still touch other bodies.  For a robot that holds the rope, `grip` is better.
 
         :raises InputError: if a gripper holds one of them.
         """
         nodes = tuple(dict.fromkeys(int(node) for node in nodes))
-        gripped = {node for one in self._grippers for node in one.nodes}.intersection(nodes)
+        gripped = {node for gripper in self._grippers for node in gripper.nodes}.intersection(nodes)
         if gripped:
             raise InputError('hold', f'the nodes {sorted(gripped)}, which a gripper holds', 'free nodes',
                              'release the gripper first')
@@ -313,34 +314,35 @@ class BulletRope:
     def grip(self, body: int, link: int, place: Sequence[float] = (0.0, 0.0, 0.0), *, nodes: int = 2,
              reach: float = 0.03) -> None:
         """
-        Let a gripper of a robot hold the rope where it is; in each step, the rope follows the gripper.
+        Let a gripper of a robot hold the rope at its position; the rope follows the gripper in each step.
 
         The rope does not touch the hand, i.e. this link with all links that are fixed to it or that it
-        moves, until it is released and the hand has moved away.  It touches all other links.
+        moves, until the gripper is released and has moved away.  The rope touches all other links.
 
         :param body: PyBullet's id of the robot.
         :param link: index of a link of the hand; -1: the base.
         :param place: (3,) [m] between the fingers, in the frame of that link (in URDF: of its joint).
         :param nodes: number of nodes next to this place that are held; 1: the rope turns freely about it;
-            2: the gripper keeps the direction of the rope, too.
+            2: the gripper also keeps the direction of the rope.
         :param reach: largest distance [m] between the place and the rope.
-        :raises InputError: if the rope is further away, or held there already.
+        :raises InputError: if the rope is further away, or already held there.
         """
         gripper = Gripper(self._client, body, link, place)
         gripper.close(self._rope.points, self._rope.held, nodes, reach)
-        gripper.touch(self.bodies, False)
+        gripper.set_contact(self.bodies, False)
         self._grippers.append(gripper)
         self._hold_all()
 
     def release(self, body: int | None = None, link: int | None = None) -> None:
-        """Open the gripper at a link of a robot; None: all of the robot, or of all robots."""
-        opened = [one for one in self._grippers if body in (None, one.body) and link in (None, one.link)]
-        self._grippers = [one for one in self._grippers if one not in opened]
+        """Open the gripper at a link of a robot; None: all grippers of the robot, or of all robots."""
+        opened = [gripper for gripper in self._grippers
+                  if body in (None, gripper.body) and link in (None, gripper.link)]
+        self._grippers = [gripper for gripper in self._grippers if gripper not in opened]
         self._leaving += opened
         self._hold_all()
 
     def _hold_all(self) -> None:
-        nodes = [*self._held, *(node for one in self._grippers for node in one.nodes)]
+        nodes = [*self._held, *(node for gripper in self._grippers for node in gripper.nodes)]
         self._rope.hold(nodes)
         self._rope.aim(self._rope.points[nodes])
 
@@ -355,34 +357,34 @@ class BulletRope:
         Give the nodes the velocities due to internal forces, gravity and self-contact.
 
         :param targets: (h, 3) [m] positions after the step of the nodes that `hold` holds;
-            None: they stay.  Nodes in a gripper go to where the gripper is now.
+            None: they stay.  Nodes in a gripper follow the gripper.
         :param turns: (h, 9) rotation matrices, row by row, by which the clamps that hold these nodes turn in
             this step; None: a clamp turns with its segment, and not about it.
         :raises SimulationError: if the rollout diverges.
         """
-        aims = self._rope.targets
+        all_targets = self._rope.targets
         if targets is not None:
-            aims[:len(self._held)] = targets
-        turned = None if turns is None else np.asarray(turns, dtype=float)
+            all_targets[:len(self._held)] = targets
+        all_turns = None if turns is None else np.asarray(turns, dtype=float)
         if self._grippers:
-            turned = self._follow(aims, turned)
-        self._rope.aim(aims, turned)
+            all_turns = self._follow(all_targets, all_turns)
+        self._rope.aim(all_targets, all_turns)
         self._send()
 
-    def _follow(self, aims: Floats, turns: Floats | None) -> Floats:
-        """Write to `aims` (h, 3) [m] where grippers are; return the `turns` (h, 9) of all held nodes."""
+    def _follow(self, targets: Floats, turns: Floats | None) -> Floats:
+        """Write the gripped nodes to `targets` (h, 3) [m]; return the `turns` (h, 9) of all held nodes."""
         count = len(self._held)
         all_turns = [np.tile(np.eye(3).ravel(), (count, 1)) if turns is None else turns]
         for gripper in self._grippers:
-            there, turn = gripper.follow()
-            aims[count:count + len(there)] = there
-            all_turns.append(np.tile(turn.ravel(), (len(there), 1)))
-            count += len(there)
+            points, turn = gripper.follow()
+            targets[count:count + len(points)] = points
+            all_turns.append(np.tile(turn.ravel(), (len(points), 1)))
+            count += len(points)
         return np.concatenate(all_turns)
 
     def _send(self) -> None:
         """
-        Give the nodes in Bullet their velocities without contact.
+        Give the nodes in Bullet their velocities before contact.
 
         :raises SimulationError: if they are not finite.
         """
@@ -399,18 +401,18 @@ class BulletRope:
         for node, target in zip(rope.held, rope.targets.tolist(), strict=True):
             pybullet.resetBasePositionAndOrientation(self.bodies[node], target, IDENTITY,
                                                      physicsClientId=client)
-        # Without its name, which PyBullet would look up for each node, a fifth faster.
+        # The client by position: looking up its keyword for each node would take a fifth longer.
         points = np.array([pybullet.getBasePositionAndOrientation(body, client)[0] for body in self.bodies])
         rope.velocities[:] = (points - rope.points) / self.time_step
         rope.support[:] = rope.velocities - rope.predicted
         rope.points[:] = points
-        for gripper in [one for one in self._leaving if one.is_clear_of(points, self._radius)]:
+        for gripper in [gripper for gripper in self._leaving if gripper.is_clear_of(points, self._radius)]:
             self._leaving.remove(gripper)
-            if not any(one.shares_links_with(gripper) for one in (*self._grippers, *self._leaving)):
-                gripper.touch(self.bodies, True)
+            if not any(gripper.shares_links_with(other) for other in (*self._grippers, *self._leaving)):
+                gripper.set_contact(self.bodies, True)
 
     def _take_step(self) -> None:
-        """Take one step of the whole world to where a script has aimed."""
+        """Take one step of the whole world to the targets of a script."""
         self._send()
         pybullet.stepSimulation(physicsClientId=self._client)
         self.after_step()
@@ -426,12 +428,12 @@ class BulletSimulator(Engine):
     Simulates trials in a PyBullet world of its own: a rope, perhaps a table and a scene.
 
     The first trial builds the world; the others reset it.  The obstacles of a scene do
-    not move.  The rope touches them with the evaluated radius; as Bullet cannot change
-    the radius of a sphere, each new radius builds the world again: about 20 ms, plus the
-    time to build the meshes.
+    not move.  The rope touches them with the evaluated radius.  Bullet cannot change the
+    radius of a sphere, so that the world is built again for each new radius: about 20 ms,
+    plus the time for the meshes.
 
     :param scene: path of a URDF file with fixed obstacles; empty: none.
-    :param obstacles: of a scene that was read before.
+    :param obstacles: instead, those of a scene that was already read.
     :param settings: see `Engine`.
     :raises InputError: if the scene cannot be used.
     """
@@ -450,16 +452,17 @@ class BulletSimulator(Engine):
         :raises SimulationError: if the rollout diverges.
         :raises InputError: if the trial grips more points than there are nodes.
         """
-        known, start, level = self._prepare(trial, physical)
+        prepared, start, level = self._prepare(trial, physical)
         radius = physical['self_collision'] if self._obstacles else _World.SPHERE
         if self._world is not None and self._world.radius != radius:
             self._end()
         if self._world is None:
-            self._world = _World(known.layout, physical, self._time_step, radius, self._obstacles)
-        return self._rollout(known, self._world.start(start, physical, level).follow(known.script.events))
+            self._world = _World(prepared.layout, physical, self._time_step, radius, self._obstacles)
+        rope = self._world.start(start, physical, level)
+        return self._rollout(prepared, rope.follow(prepared.script.events))
 
     def close(self) -> None:
-        """Drop what is known of the trials, and end the PyBullet client; the next trial starts another."""
+        """Drop the prepared trials, and end the PyBullet client; the next trial starts another."""
         super().close()
         self._end()
 
@@ -469,7 +472,7 @@ class BulletSimulator(Engine):
             self._world = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out the PyBullet client, too: it belongs to this process."""
+        """Leave out the PyBullet client, too, which belongs to this process."""
         return {**super().__getstate__(), '_world': None}
 
 
@@ -477,10 +480,10 @@ class _World:
     """
     A PyBullet client with a rope, a plane and obstacles.
 
-    :param radius: [m] of the rope's spheres; the plane is placed to suit it.
+    :param radius: [m] of the rope's spheres; the height of the plane depends on it.
     """
 
-    SPHERE = 0.005  # m; the radius if there is only a plane: one world does for all trials
+    SPHERE = 0.005  # m; the radius if there is only a plane, so that one world serves all trials
     AWAY = -1e3  # m; height of the plane where nothing can touch it
 
     def __init__(self, layout: NodeLayout, physical: Mapping[str, float], time_step: float, radius: float,
@@ -505,7 +508,7 @@ class _World:
     def start(self, start: core.Start, physical: Mapping[str, float], touching: float | None) -> BulletRope:
         """Place rope and table; `touching` [m] is the height of nodes that touch the table."""
         height = self.AWAY if touching is None else touching - self.radius
-        # Bullet keeps contact points between steps; a step without contact drops those of the last trial.
+        # Bullet keeps contact points between steps; a step without contact drops those of the trial before.
         self._place_table(self.AWAY)
         if self._among_obstacles:
             self._rope.move_bodies(self._rope.points + (0, 0, -self.AWAY))

@@ -25,17 +25,18 @@ from dlo_calibration.simulation.protocol import (
 )
 from dlo_calibration.simulation.script import Script, Settling
 
-MOST_KNOWN = 1000  # trials that are kept; a plan simulates each of its trials only once
-MOST_POSITIONS = 200_000  # of hands in the scripts that are kept: 100 MB if each hand holds four nodes
+CACHE_SIZE = 1000  # prepared trials; a plan simulates each of its trials only once
+MOST_POSITIONS = 200_000  # of hands in the cached scripts: 100 MB if each hand holds four nodes
+NO_TABLE = -1e6  # m; level of nodes on a table so low that no node touches it
 
 
 @dataclass(frozen=True)
 class Prepared:
     """
-    What of a trial does not depend on the parameters.
+    The parts of a trial that do not depend on the parameters.
 
     :param level: height [m] of nodes on the table; None if it is unknown, or if there is no table.
-    :param start: of the nodes; where their height on the table is unknown, as they were observed.
+    :param start: of the nodes; if the level is unknown, at their observed heights.
     """
 
     trial: Trial
@@ -50,7 +51,7 @@ class Engine:
     Simulates trials on a table or in the air.
 
     The table is placed so that the rope rests on it at the measured height for every
-    evaluated radius: no radius throws the rope up or lets it fall.  Threads may share an engine.
+    evaluated radius: no radius throws the rope up or lets it fall.
 
     :param table: whether there is a table.
     :param table_height: height of the table [m].
@@ -73,42 +74,42 @@ class Engine:
         self._begin()
 
     def _begin(self) -> None:
-        self._prepared: dict[int, Prepared] = {}  # by the identities of the trials
-        self._lock = threading.Lock()  # guards them
+        self._prepared: dict[int, Prepared] = {}  # cache, by the ids of the trials
+        self._lock = threading.Lock()  # guards it
 
     def _prepare(self, trial: Trial,
                  physical: Mapping[str, float]) -> tuple[Prepared, core.Start, float | None]:
         """
-        Return what is known of a trial, where its nodes start, and their height [m] on the table, or None.
+        Return a prepared trial, the start of its nodes, and their height [m] on the table, or None.
 
         :raises SimulationError: if a hand moves for too long.
         :raises InputError: if the trial grips more points than there are nodes.
         """
         with self._lock:
-            known = self._prepared.get(id(trial))
-            if known is None or known.trial is not trial:
+            prepared = self._prepared.get(id(trial))
+            if prepared is None or prepared.trial is not trial:
                 level = None if self._table_height is None else resting_level(trial, self._table_height)
                 layout = NodeLayout.of(trial, self._nodes)
                 script = Script.of(trial, layout, self._time_step, self._settling)
-                known = Prepared(trial, layout, level, layout.start(level), script)
-                self._keep(known)
-        if self._table_height is None or known.level is not None:
-            return known, known.start, known.level
+                prepared = Prepared(trial, layout, level, layout.start(level), script)
+                self._cache(prepared)
+        if self._table_height is None or prepared.level is not None:
+            return prepared, prepared.start, prepared.level
         level = self._table_height + physical['self_collision']
-        return known, known.layout.start(level), level
+        return prepared, prepared.layout.start(level), level
 
-    def _keep(self, known: Prepared) -> None:
-        """Keep a prepared trial; drop the oldest ones if they are too many or too large."""
-        trials, positions = self._prepared, known.script.positions
-        trials.pop(id(known.trial), None)
+    def _cache(self, prepared: Prepared) -> None:
+        """Cache a prepared trial, unless it is too large; drop the oldest ones if they are too many."""
+        trials, positions = self._prepared, prepared.script.positions
+        trials.pop(id(prepared.trial), None)
         if positions > MOST_POSITIONS:
             return
-        while len(trials) >= MOST_KNOWN or (
+        while len(trials) >= CACHE_SIZE or (
                 positions + sum(trial.script.positions for trial in trials.values()) > MOST_POSITIONS):
             del trials[next(iter(trials))]
-        trials[id(known.trial)] = known
+        trials[id(prepared.trial)] = prepared
 
-    def _rollout(self, known: Prepared, outcome: tuple[Floats, tuple[bool, ...], int] | None) -> Rollout:
+    def _rollout(self, prepared: Prepared, outcome: tuple[Floats, tuple[bool, ...], int] | None) -> Rollout:
         """
         Return a rollout for an outcome of the core.
 
@@ -117,7 +118,7 @@ class Engine:
         if outcome is None:
             raise SimulationError('the rollout diverged: the chain is no longer finite')
         nodes, settled, steps = outcome
-        return Rollout(known.layout.observe @ nodes, settled, steps * self._time_step, steps)
+        return Rollout(prepared.layout.observe @ nodes, settled, steps * self._time_step, steps)
 
     def refined(self) -> Self:
         """Return an engine with twice the segments and half the time step."""
@@ -126,11 +127,11 @@ class Engine:
         return finer
 
     def close(self) -> None:
-        """Drop what is known of the trials."""
+        """Drop the prepared trials."""
         self._prepared.clear()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out what belongs to this process, and to this engine alone."""
+        """Leave out the cache, which belongs to this engine alone, and its lock."""
         return {name: value for name, value in self.__dict__.items() if name not in ('_prepared', '_lock')}
 
     def __setstate__(self, state: Mapping[str, Any]) -> None:
@@ -138,18 +139,17 @@ class Engine:
         self._begin()
 
 
-NO_TABLE = -1e6  # m; a table so low that no node touches it
-
-
 class CompiledSimulator(Engine, TogetherSimulator):
     """
     Simulates trials on a table or in the air, about 60 times as fast as `bullet.BulletSimulator`.
+
+    Threads may share it.
 
     A trial that grips more points than there are nodes is refused with an InputError.
     """
 
     name = 'compiled'
-    at_a_time = 48  # twelve for each lane, of which some are empty only towards the end
+    at_a_time = 48  # twelve for each lane, so that lanes are empty only towards the end
 
     def simulate_together(self, jobs: Sequence[Job], stop: core.Stop) -> list[Rollout | SimulationError]:
         """Simulate each job, four at a time; see `TogetherSimulator`."""
@@ -158,17 +158,18 @@ class CompiledSimulator(Engine, TogetherSimulator):
         packed = []
         for trial, physical in jobs:
             try:
-                known, start, level = self._prepare(trial, physical)
+                job, start, level = self._prepare(trial, physical)
             except SimulationError as error:
                 prepared.append(error)
             else:
-                prepared.append(known)
-                packed.append((known.script.events, start, physical, NO_TABLE if level is None else level))
+                prepared.append(job)
+                packed.append((job.script.events, start, physical, NO_TABLE if level is None else level))
         outcomes = iter(core.roll_out(packed, self._time_step, stop))
-        for job in prepared:
+        for item in prepared:
             try:
-                rollouts.append(job if isinstance(job, SimulationError) else
-                                self._rollout(job, next(outcomes)))
+                if isinstance(item, SimulationError):
+                    raise item
+                rollouts.append(self._rollout(item, next(outcomes)))
             except SimulationError as error:
                 rollouts.append(error)
         return rollouts

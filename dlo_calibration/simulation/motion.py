@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Motion: the simulated course of a trial, frame by frame."""
+"""Motion: the simulated motion of a trial, frame by frame."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.simulation.protocol import Simulator
 
 FRAME_RATE = 10  # 1/s; a GIF stores times in units of 0.01 s
-MOST_FRAMES = 120  # keeps an animation small: a longer motion is shown faster
+MOST_FRAMES = 120  # of an animation, for its size: a longer motion is shown faster
 
 
 @dataclass(frozen=True)
@@ -35,11 +35,11 @@ class Motion:
 
 
 def hands_at(trial: Trial, time: float) -> dict[str, tuple[Floats, bool]]:
-    """Return where each hand of a trial is at a time [s], (3,) [m], and whether it is closed, by name."""
+    """Return by name where each hand of a trial is at a time [s], (3,) [m], and whether it is closed."""
     following = next((goal for goal in trial.goals if goal.time >= time), trial.goals[-1])
     holding = {hand.name for hand in trial.holding(
         Goal(trial.initial, time, stable=False, held_by=following.held_by))}
-    current: dict[str, Hand] = {}  # the latest path of each name, or the first
+    current: dict[str, Hand] = {}  # by name, the hand that closed last, or else the first
     for hand in trial.hands:
         if hand.name not in current or hand.start <= time:
             current[hand.name] = hand
@@ -49,12 +49,12 @@ def hands_at(trial: Trial, time: float) -> dict[str, tuple[Floats, bool]]:
 def densely(trial: Trial, frames: int = MOST_FRAMES) -> Trial:
     """Return a trial with additional timed goals, one for each frame; their chains are placeholders."""
     last = max(max(hand.end for hand in trial.hands) + 1.0, trial.goals[-1].time)
-    taken = {goal.time for goal in trial.goals}
+    times = {goal.time for goal in trial.goals}
     count = min(frames, max(2, round(last * FRAME_RATE) + 1))
     added = []
     for time in np.linspace(0.0, last, count):
-        if float(time) not in taken:
-            # Between two goals, the hands hold what they hold at the later one, as in the trial itself.
+        if float(time) not in times:
+            # Between two goals, the hands that hold are those of the later goal, as in the trial itself.
             following = next((goal for goal in trial.goals if goal.time > time), trial.goals[-1])
             added.append(Goal(trial.initial, float(time), stable=False, held_by=following.held_by))
     return replace(trial, goals=(*trial.goals, *added))
@@ -69,8 +69,8 @@ def simulated_motion(trial: Trial, simulator: Simulator, physical: Mapping[str, 
     """
     dense = densely(trial)
     chains = simulator.simulate(dense, physical).chains
-    asked = {id(goal.chain) for goal in trial.goals}
-    ends = [k for k, goal in enumerate(dense.goals) if id(goal.chain) in asked]
+    observed = {id(goal.chain) for goal in trial.goals}
+    ends = [k for k, goal in enumerate(dense.goals) if id(goal.chain) in observed]
     # A stable goal is simulated until the DLO rests, which is later than its time.
-    shown = [k for k, goal in enumerate(dense.goals) if not goal.stable]
-    return Motion(np.array([dense.goals[k].time for k in shown]), chains[shown], chains[ends])
+    frames = [k for k, goal in enumerate(dense.goals) if not goal.stable]
+    return Motion(np.array([dense.goals[k].time for k in frames]), chains[frames], chains[ends])

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""NodeLayout: where the nodes of the simulated DLO lie, and how they give the observed points."""
+"""NodeLayout: the places of the nodes of the simulated DLO, and their relation to the observed points."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from dlo_calibration.observation.noise import NO_NOISE, noise, noise_of, smooth
 from dlo_calibration.observation.table import rest_on
 from dlo_calibration.simulation import core
 
-MERGED = 0.15  # of the mean distance of nodes
+MERGING = 0.15  # of the mean distance of nodes; grips that are nearer share a node
 
 
 @dataclass(frozen=True)
@@ -29,11 +29,11 @@ class NodeLayout:
     """
     Nodes of the simulated DLO.
 
-    :param places: (N,) [m] arc lengths of the nodes at rest, from 0, increasing; every
-        place that a hand grips has a node of its own.
+    :param places: (N,) [m] arc lengths of the nodes at rest, from 0, increasing; there is a
+        node at every place that a hand grips.
     :param points: (N, 3) [m] positions of the nodes at the start.
     :param velocities: (N, 3) [m/s] at the start.
-    :param observe: (n, N) weights; multiplied by the nodes' positions they give the observed points.
+    :param observe: (n, N) weights; their product with the nodes' positions is the observed points.
     :param point_places: (n,) [m] arc lengths of the observed points.
     :param features: (N,) number of points annotated as feature at each node, see `feature_shares`.
     :param directions: (N - 1, 3) unit vectors across the segments in clamps that hold from the start, see
@@ -49,7 +49,7 @@ class NodeLayout:
     directions: Floats
 
     def start(self, level: float | None) -> core.Start:
-        """Return the start of nodes; those at rest are at a level [m], or where they are if it is None."""
+        """Return the start of the nodes; those that rest are moved to a level [m], unless it is None."""
         points = self.points if level is None else rest_on(self.points, level)
         return core.Start(self.places, points, self.velocities, self.features, self.directions)
 
@@ -61,16 +61,16 @@ class NodeLayout:
     @classmethod
     def of(cls, trial: Trial, count: int) -> NodeLayout:
         """
-        Lay out `count` nodes, as equally spaced as the gripped points allow.
+        Return a layout of `count` nodes, as equally spaced as the gripped points allow.
 
-        No node lies inside a clamp that holds from the start, because that piece does not bend.
+        No node lies inside a clamp that holds from the start, because this piece does not bend.
         The initial chain is smoothed according to the noise level of the trial's chains: noise
-        makes a chain longer, and bends a stiff DLO more than is possible. Where the trial has the arc
-        lengths at rest, each node begins at the same share of the way between two points as at rest.
+        makes a chain longer, and bends a stiff DLO more than is possible. If the trial has the arc
+        lengths at rest, each node starts between the same two points, at the same share, as at rest.
 
         :raises InputError: if more points are gripped than there are nodes.
         """
-        initial = _without_noise(trial)
+        initial = _smoothed_start(trial)
         along = initial.arc_lengths()
         point_places = along if trial.places is None else trial.places
         fixed = _fixed_places(trial, point_places, count)
@@ -96,14 +96,14 @@ def _fixed_places(trial: Trial, places: Floats, count: int) -> Floats:
     """
     Return the arc lengths [m] at which nodes must lie: both ends, gripped points, and grips between points.
 
-    A grip between points that is nearer to another of them than MERGED shares its node: short segments would
-    be stiff, and a hand that grips anew at the same place does not close at exactly the same one.
+    A grip between points shares the node of another of these places if that is nearer than MERGING: short
+    segments would be stiff, and a hand that regrips a place does not close at exactly the same arc length.
     """
     points = [places[grip] for hand in trial.hands if not hand.offset for grip in hand.grips]
     fixed = np.unique(np.concatenate([[0.0], points, places[-1:]]))
     between = [hand for hand in trial.hands if hand.offset]
     for place in sorted(grip_place(places, hand.grips[0], hand.offset) for hand in between):
-        if np.abs(fixed - place).min() > MERGED * places[-1] / (count - 1):
+        if np.abs(fixed - place).min() > MERGING * places[-1] / (count - 1):
             fixed = np.sort(np.append(fixed, place))
     return fixed
 
@@ -112,7 +112,7 @@ def feature_shares(chain: Chain, places: Floats) -> Floats:
     """
     Return the number of points annotated as feature at each node, (N,), with fractions.
 
-    A point between two nodes is shared by both, so that its centre of mass stays in place.
+    A point between two nodes is divided between them so that the centre of mass stays in place.
 
     :param places: (N,) [m] arc lengths of the nodes.
     """
@@ -125,17 +125,17 @@ def feature_shares(chain: Chain, places: Floats) -> Floats:
     return shares
 
 
-def _without_noise(trial: Trial) -> Chain:
+def _smoothed_start(trial: Trial) -> Chain:
     """Return the initial chain, smoothed according to the noise level of the trial."""
     if all(goal.chain is trial.initial for goal in trial.goals):
-        return _without_noise_of_its_own(trial.initial, 1 + len(trial.goals))
+        return _smoothed_alone(trial.initial, 1 + len(trial.goals))
     return _smoothed(trial.initial, noise([trial]))
 
 
 @lru_cache(maxsize=8)
-def _without_noise_of_its_own(initial: Chain, views: int) -> Chain:
-    """Return an initial chain that nothing was observed after, as in many trials of a plan; see above."""
-    return _smoothed(initial, noise_of([np.stack([initial.observed] * views)]))
+def _smoothed_alone(initial: Chain, count: int) -> Chain:
+    """Return the smoothed initial chain of a trial whose `count` chains are all this one, as in a plan."""
+    return _smoothed(initial, noise_of([np.stack([initial.observed] * count)]))
 
 
 def _smoothed(initial: Chain, sigma: float) -> Chain:
@@ -146,9 +146,9 @@ def _smoothed(initial: Chain, sigma: float) -> Chain:
 
 def spread_places(fixed: Floats, count: int, rigid: NDArray[np.bool_] | None = None) -> Floats:
     """
-    Return `count` increasing arc lengths [m]: the (f,) `fixed` ones, and others evenly between them.
+    Return `count` increasing arc lengths [m]: the (f,) `fixed` ones, and others as evenly as possible.
 
-    :param rigid: (f - 1,) pieces between fixed places that get no places inside, unless all are rigid.
+    :param rigid: (f - 1,) pieces between fixed places that get no others inside, unless all are rigid.
     """
     pieces = np.ones(len(fixed) - 1, int)
     widths = np.diff(fixed)

@@ -14,9 +14,9 @@ import numpy as np
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.simulation.core import Stop as Stop  # so that others can use it
+from dlo_calibration.simulation.core import Stop as Stop  # re-exported
 
-# Defaults of both engines and of the options; doc/physics.md shows how little a finer model changes.
+# Defaults of both engines and of the options; doc/physics.md shows the small effect of a finer model.
 DEFAULT_NODES = 41
 DEFAULT_TIME_STEP = 0.003  # s
 
@@ -54,7 +54,7 @@ class Simulator(Protocol):
     """
     Simulates trials; the same call gives the same rollout, bit for bit.
 
-    Any number of threads may call it at the same time.  Other machines get a pickled one.
+    Any number of threads may call it at the same time.  It is picklable, for other machines.
     """
 
     name: str
@@ -77,7 +77,7 @@ class Simulator(Protocol):
 @runtime_checkable
 class TogetherSimulator(Protocol):
     """
-    A simulator that takes several jobs in one call, which can be stopped in the middle of a rollout.
+    A simulator that takes several jobs in one call, and can be stopped in the middle of a rollout.
 
     :param at_a_time: largest number of jobs that should share a call.
     """
@@ -102,7 +102,7 @@ class TogetherSimulator(Protocol):
 
 def simulate_all(simulator: Simulator, jobs: Sequence[Job], stop: Stop) -> list[Rollout | SimulationError]:
     """
-    Return the rollout of each job, or why it failed; together if the simulator can.
+    Return the rollout of each job, or why it failed; in one call of a `TogetherSimulator`.
 
     :raises CancelledError: once `stop` is set.
     """

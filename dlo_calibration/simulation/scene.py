@@ -8,15 +8,16 @@ Only links, the origins of joints (movable joints are at position 0), collision 
 and their friction are read.  The importer of an engine would make one articulated body,
 whose links move when they are touched.
 
-The file may come from a stranger.  Its XML has no document type and no entities, all sizes
-are limited, and meshes are read only from the folder of the file, and from packages.  No other
-parser sees its .obj and .stl files: that of PyBullet ends the process at an index out of range.
+The file may come from a stranger.  Document types and entities are refused, all sizes are
+limited, and meshes are read only from the folder of the file and from packages.  No other
+parser reads its .obj and .stl files, as PyBullet's ends the process at an index out of range.
 PyBullet gets a file that is written here.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 import os
 from pathlib import Path
 import re
@@ -26,7 +27,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from dlo_calibration.errors import InputError
+from dlo_calibration.errors import InputError, shortened
 from dlo_calibration.model.chain import Floats, frozen_array
 
 if TYPE_CHECKING:
@@ -36,17 +37,18 @@ KINDS = ('.obj', '.stl')
 MOST_TRIANGLES = 200_000  # of all meshes of a scene: about 250 MB in Bullet
 LARGEST_FILE = 64 * 2**20  # bytes; that many triangles need less
 LONGEST_LINE = 10_000  # bytes; a face of a thousand corners fits
-FURTHEST = 1e6  # m; Bullet computes meshes with 7 digits, so that 10 cm are lost there already
+FURTHEST = 1e6  # m; Bullet computes meshes with 7 digits, so that the error there is already 10 cm
 
 #: One triangle of a binary .stl file: its normal, which is not used, its corners and a colour.
 _FACET = np.dtype([('normal', '<f4', 3), ('corners', '<f4', (3, 3)), ('colour', '<u2')])
 
-# Each is about ten times what a robot cell needs; then reading takes seconds and some 100 MB at most.
+# About ten times what a robot cell needs; reading takes at most seconds and some 100 MB.
 MOST_BYTES = 8 * 2**20  # of the URDF file
 MOST_ELEMENTS = 100_000
 MOST_LINKS = 10_000
 MOST_SHAPES = 2000
 MOST_TEXT = 100  # characters of an attribute with numbers
+excerpt = partial(shortened, most=60)  # of a text of the file, for errors
 SMALLEST, LARGEST = 1e-6, FURTHEST  # m; sizes of shapes, and the scale of a mesh
 
 NO_TRIANGLES = frozen_array(np.zeros((0, 3, 3)))
@@ -67,7 +69,7 @@ class Obstacle:
         radius of a cylinder or capsule along z; (3,) scale of a mesh.
     :param position: (3,) [m] of its centre.
     :param turn: (4,) orientation, quaternion x y z w.
-    :param friction: Coulomb coefficient; 1, as of the table, if the link has none.
+    :param friction: Coulomb coefficient; 1, that of the table, if the link has none.
     :param triangles: (t, 3, 3) [m] corners of the triangles of a mesh, before it is scaled; else empty.
     """
 
@@ -97,9 +99,9 @@ def read_scene(path: str) -> tuple[Obstacle, ...]:
     try:
         robot = _parsed(octets)
     except (ElementTree.ParseError, ValueError) as error:
-        raise unusable(path, f'no XML document ({shown(str(error), 150)})') from error
+        raise unusable(path, f'no XML document ({shortened(str(error), 150)})') from error
     if robot.tag != 'robot':
-        raise unusable(path, f'the root element <{shown(robot.tag)}>', 'name a <robot> file')
+        raise unusable(path, f'the root element <{excerpt(robot.tag)}>', 'name a <robot> file')
     obstacles = tuple(_Reader(path, robot).obstacles())
     if not obstacles:
         raise unusable(path, 'no collision shape', 'add <collision> elements')
@@ -115,7 +117,7 @@ def _parsed(octets: bytes) -> ElementTree.Element:
     """
     Return the root element of a document.
 
-    :raises ValueError: if it has a document type, whose entities could fill the memory, or is too large.
+    :raises ValueError: if it is too large, or has a document type, whose entities could fill the memory.
     """
     if len(octets) > MOST_BYTES:
         raise ValueError(f'more than {MOST_BYTES} bytes')
@@ -124,12 +126,7 @@ def _parsed(octets: bytes) -> ElementTree.Element:
         raise ValueError('a document type or an entity, which is not allowed')
     if text.count('<') > 2 * MOST_ELEMENTS:
         raise ValueError(f'more than {MOST_ELEMENTS} elements')
-    return ElementTree.fromstring(text)  # of a text, so that no declaration changes how it is decoded
-
-
-def shown(text: str, most: int = 60) -> str:
-    """Return a text of the file as an error shows it: its beginning, if it is long."""
-    return text if len(text) <= most else f'{text[:most]}...'
+    return ElementTree.fromstring(text)  # of a text, so that no declaration changes the decoding
 
 
 class _Reader:
@@ -144,8 +141,8 @@ class _Reader:
         for joint in robot.findall('joint'):
             ends = [end.get('link', '') for tag in ('parent', 'child') for end in joint.findall(tag)]
             if len(ends) != 2 or ends[1] in self._joints or not set(ends) <= set(self._links):
-                raise unusable(path, f'the joint {shown(joint.get("name", ""))!r} from and to '
-                               f'{shown(str(ends))}',
+                raise unusable(path, f'the joint {excerpt(joint.get("name", ""))!r} from and to '
+                               f'{excerpt(str(ends))}',
                                'give each joint a parent link and a child link of its own')
             self._joints[ends[1]] = ends[0], joint
 
@@ -159,11 +156,11 @@ class _Reader:
         frictions = {name: self._friction(link) for name, link in self._links.items()}
         for name, collision, geometry in shapes:
             if geometry.tag not in SIZES:
-                raise unusable(self._path, f'the shape <{shown(geometry.tag)}> of link {shown(name)!r}',
+                raise unusable(self._path, f'the shape <{excerpt(geometry.tag)}> of link {excerpt(name)!r}',
                                f'use one of {", ".join(SIZES)}')
             position, turn = _after(self._frame(name), self._origin(collision))
             if np.abs(position).max() > FURTHEST:
-                raise unusable(self._path, f'a {geometry.tag} of link {shown(name)!r} at '
+                raise unusable(self._path, f'a {geometry.tag} of link {excerpt(name)!r} at '
                                f'{position.tolist()} m', f'place it within {FURTHEST:g} m')
             sizes = self._sizes(geometry)
             mesh = self._mesh(geometry) if geometry.tag == 'mesh' else NO_TRIANGLES
@@ -183,7 +180,7 @@ class _Reader:
             waiting.append(name)
             name = self._joints[name][0]
             if len(waiting) > len(self._links):
-                raise unusable(self._path, f'joints that form a loop at link {shown(name)!r}')
+                raise unusable(self._path, f'joints that form a loop at link {excerpt(name)!r}')
         frame = self._frames.setdefault(name, (np.zeros(3), Rotation.identity()))
         for link in reversed(waiting):
             frame = self._frames[link] = _after(frame, self._origin(self._joints[link][1]))
@@ -214,18 +211,18 @@ class _Reader:
     def _mesh(self, geometry: ElementTree.Element) -> Floats:
         """Return the triangles of a mesh, as `read_mesh` does; each file is read once."""
         name = geometry.get('filename', '')
-        said = f'the mesh {shown(name)!r}'
+        mesh = f'the mesh {excerpt(name)!r}'
         try:
             file = self._file(name)
             if file is None:
-                raise unusable(self._path, f'{said}, which is not there', 'name an .obj or .stl file in the '
+                raise unusable(self._path, f'{mesh}, which is not there', 'name an .obj or .stl file in the '
                                'folder of the scene, relative to it, or package://...')
             if file not in self._meshes:
-                if sum(one.stat().st_size for one in (*self._meshes, file)) > LARGEST_FILE:
+                if sum(path.stat().st_size for path in (*self._meshes, file)) > LARGEST_FILE:
                     raise ValueError(f'more than {LARGEST_FILE} bytes with the meshes before')
                 self._meshes[file] = read_mesh(str(file))
         except (OSError, ValueError) as error:
-            raise unusable(self._path, f'{said}: {shown(str(error), 150)}',
+            raise unusable(self._path, f'{mesh}: {shortened(str(error), 150)}',
                            'export the mesh again, as a simpler .obj or .stl') from error
         return self._meshes[file]
 
@@ -233,7 +230,7 @@ class _Reader:
         """
         Return the path of a mesh in the folder of the scene or in a package; None if there is none.
 
-        :raises InputError: if it is outside of them.
+        :raises InputError: if it is elsewhere.
         """
         kind, _, rest = name.partition('://')
         if kind == 'package':
@@ -248,15 +245,15 @@ class _Reader:
         folder = Path(os.path.realpath(self._path)).parent
         file = Path(os.path.realpath(folder / (rest or name)))
         if not file.is_relative_to(folder):
-            raise unusable(self._path, f'the mesh {shown(name)!r}, which is outside the folder of the scene',
-                           'move it there, or name it package://...')
+            raise unusable(self._path, f'the mesh {excerpt(name)!r}, which is outside the folder of the '
+                           'scene', 'move it there, or name it package://...')
         return file if name and file.exists() else None
 
     def _friction(self, link: ElementTree.Element) -> float:
         element = link.find('contact/lateral_friction')
         friction = 1.0 if element is None else float(self._numbers(element, 'value', 1)[0])
         if friction < 0:
-            name = shown(link.get('name', ''))
+            name = excerpt(link.get('name', ''))
             raise unusable(self._path, f'lateral_friction {friction:g} of link {name!r}', 'make it 0 or more')
         return friction
 
@@ -267,19 +264,19 @@ class _Reader:
         except ValueError:
             numbers = np.zeros(0)
         if len(numbers) != count or not (np.abs(numbers) <= LARGEST).all():  # NaN is not
-            raise unusable(self._path, f'{name}={shown(text)!r} in <{element.tag}>',
+            raise unusable(self._path, f'{name}={excerpt(text)!r} in <{element.tag}>',
                            f'write {count} number{"s" if count > 1 else ""} up to {LARGEST:g}')
         return numbers
 
 
 def _after(first: tuple[Floats, Rotation], second: tuple[Floats, Rotation]) -> tuple[Floats, Rotation]:
-    """Return the frame `second`, given relative to the frame `first`, in the frame of `first`'s parent."""
+    """Return the composition of two frames, of which the second is relative to the first."""
     return first[0] + first[1].apply(second[0]), first[1] * second[1]
 
 
 def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
     """
-    Open a file for reading; refuse what could block for ever, such as a pipe.
+    Open a regular file for reading; a pipe, for example, could block for ever.
 
     :raises OSError: if it cannot be opened, or is a directory, a pipe or a device.
     """
@@ -345,7 +342,7 @@ def _obj(stream: BinaryIO) -> Floats:
 
 
 def _index(word: bytes, count: int) -> int:
-    """Return the index of a vertex, from 0, in a word such as ``3/1/2``; -1 is the last one so far."""
+    """Return the index of a vertex, from 0, in a word such as ``3/1/2``; -1 is the last vertex so far."""
     index = int(word.partition(b'/')[0])
     if not -count <= index <= 3 * MOST_TRIANGLES or index == 0:
         raise ValueError(f'a face with vertex {index} after {count} vertices')

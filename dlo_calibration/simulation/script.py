@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Script: what happens in a simulated trial, step by step, before it is simulated.
+Script: the events of a simulated trial, written before it is simulated.
 
 Hands close, move and open.  Timed goals are compared at their time; for a goal that
 is a stable configuration, the simulation continues until the DLO has come to rest.
-Time in which the DLO stays at rest is skipped.  Every engine follows the same script,
+Time in which the DLO stays at rest is skipped.  Every engine follows the same script
 with every parameter set.
 """
 
@@ -26,19 +26,19 @@ from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.simulation import core
 from dlo_calibration.simulation.nodes import NodeLayout
 
-MOST_STEPS = 2_000_000  # of one path, which is in memory: 200 MB; 100 minutes at the usual time step
-MOST_TRACED = 5000  # steps that are traced at once: all of them are in memory
-ROUNDING = 1e-9  # s; instants that differ by less are the same
+MOST_STEPS = 2_000_000  # of one path, which takes 200 MB of memory; 100 minutes at the default time step
+MOST_TRACED = 5000  # steps in one event with timed goals, which are all in memory
+ROUNDING = 1e-9  # s; instants that differ by less are equal
 
 
 @dataclass(frozen=True)
 class Settling:
     """
-    When a DLO counts as stable: no point moves further than a distance within a time.
+    When a DLO counts as stable: no point moves as far as a distance within a time.
 
     :param distance: this distance [m].
-    :param time: this time [s], while all hands are at rest.
-    :param limit: longest time [s] to wait for it.
+    :param time: this time [s], in which all hands are at rest.
+    :param limit: longest time [s] to wait until the DLO is stable.
     """
 
     distance: float = 0.0005
@@ -49,10 +49,10 @@ class Settling:
 @dataclass(frozen=True)
 class Script:
     """
-    What happens in a simulated trial.
+    The events of a simulated trial.
 
-    :param events: as the core takes them.
-    :param positions: how many positions of hands the events contain; their memory grows with them.
+    :param events: for the core.
+    :param positions: number of positions of hands in the events, a measure of their memory.
     """
 
     events: core.Script
@@ -79,10 +79,10 @@ class _ClosedHand:
     since: int  # number of steps when it closed
     positions: Floats  # (k, 3) [m] of the hand after each later step, until it rests
     rotations: Floats | None  # (k, 9) since it closed, row by row
-    turns: Floats  # (k + 1, 9) in each of these steps, and none
+    turns: Floats  # (k + 1, 9) in each of these steps, and the identity
 
     def grip(self, steps: int, count: int) -> core.Grip:
-        """Return what it does in the `count` steps after `steps` of the trial."""
+        """Return its poses in the `count` steps after `steps` steps of the trial."""
         first = steps - self.since
         return core.Grip(self.rows, _rows(self.positions, first, count),
                          None if self.rotations is None else _rows(self.rotations, first, count),
@@ -100,15 +100,15 @@ class _Writer:
         self._settling = settling
         self._time = 0.0  # [s] of the trial
         self._steps = 0
-        self._last = 0.0  # time [s] of the points that are remembered
+        self._last = 0.0  # time [s] of the remembered points
         self._goal = 0  # index of the current goal
         self._timed = [goal.time for goal in trial.goals if not goal.stable]  # [s], increasing
         self._closed: dict[str, _ClosedHand] = {}
         self._waiting = list(trial.hands)
 
     def write(self) -> None:
-        """Go up to each goal in turn."""
-        seen = 0  # number of goals so far
+        """Write the events up to each goal in turn."""
+        seen = 0  # number of goals that have been seen
         for k, goal in enumerate(self._trial.goals):
             self._goal = k
             if goal.stable:
@@ -121,7 +121,7 @@ class _Writer:
                 seen = self._trace(k + 1)
 
     def _goals(self, first: int) -> Iterator[Goal]:
-        """Yield the goals from an index on; no copy, because a stream has thousands."""
+        """Yield the goals from an index on, without a copy: a stream has thousands."""
         for k in range(first, len(self._trial.goals)):
             yield self._trial.goals[k]
 
@@ -145,7 +145,7 @@ class _Writer:
         """
         See the DLO at timed goals, from an index on up to the next event of a hand; return the next index.
 
-        The result is the same as for each goal by itself, but one call to the stepper does.
+        The result is the same as with `_see` for each goal, but in a single event.
         """
         step = self._step
         self._close()
@@ -172,7 +172,7 @@ class _Writer:
         return last
 
     def _act_until(self, until: float) -> None:
-        """Let hands act until an instant; skip time in which no hand moves and the DLO is at rest."""
+        """Let hands act until an instant; skip time in which no hand moves and the DLO rests."""
         while self._time < until - ROUNDING:
             self._close()
             ends = [hand.end for hand in self._hands() if hand.end > self._time + ROUNDING]
@@ -186,7 +186,7 @@ class _Writer:
             self._open_arrived()
 
     def _nothing_timed_before(self, instant: float) -> bool:
-        """Tell whether time until an instant may be skipped: no timed goal lies in it."""
+        """Return whether there is no timed goal until an instant, so that this time may be skipped."""
         return bisect_right(self._timed, self._time) >= bisect_right(self._timed, instant + self._step)
 
     def _close(self) -> None:
@@ -220,7 +220,7 @@ class _Writer:
                     self._release(closed)
 
     def _open(self, goal: Goal) -> None:
-        """Open the hands that have arrived and that a goal shows open."""
+        """Open the hands that have arrived and are open in a goal."""
         for closed in list(self._closed.values()):
             if closed.hand.end < goal.time and not self._trial.holds(closed.hand, goal):
                 self._release(closed)
@@ -228,12 +228,12 @@ class _Writer:
     def _let_go(self, nodes: tuple[int, ...]) -> None:
         """Release nodes that another hand grips from the hands that hold them."""
         for name, closed in list(self._closed.items()):
-            kept = [k for k, node in enumerate(closed.nodes) if node not in nodes]
-            if not kept:
+            remaining = [k for k, node in enumerate(closed.nodes) if node not in nodes]
+            if not remaining:
                 del self._closed[name]
-            elif len(kept) < len(closed.nodes):
-                closed.nodes = tuple(closed.nodes[k] for k in kept)
-                closed.rows = [closed.rows[k] for k in kept]
+            elif len(remaining) < len(closed.nodes):
+                closed.nodes = tuple(closed.nodes[k] for k in remaining)
+                closed.rows = [closed.rows[k] for k in remaining]
 
     def _release(self, closed: _ClosedHand) -> None:
         del self._closed[closed.hand.name]
@@ -244,7 +244,7 @@ class _Writer:
             [node for closed in self._closed.values() for node in closed.nodes]))
 
     def _settle(self, limit: float) -> None:
-        """Let the DLO come to rest, at most for a limit [s], while no hand moves."""
+        """Let the DLO come to rest while no hand moves, for at most a limit [s]."""
         time, count = self._time, round(limit / self._step)
         if count:
             self._advance(count, settles=True)
@@ -276,8 +276,9 @@ def _hand_steps(hand: Hand, start: float, step: float, count: int) -> tuple[Floa
 
     :param start: time [s] in the trial.
     :param step: [s].
-    :returns: (count + 1, 3) [m] positions after 0 to `count` steps; (count + 1, 9) rotations until then, row
-        by row, or None if it does not turn; (count + 1, 9) rotations in each step, and at last none.
+    :returns: (count + 1, 3) [m] positions after 0 to `count` steps; (count + 1, 9) rotations since the first
+        position, row by row, or None if it does not turn; (count + 1, 9) rotations in each step, and the
+        identity.
     """
     positions, turns = hand.poses(start + step * np.arange(count + 1))
     each = np.concatenate([turns[1:] @ turns[:-1].transpose(0, 2, 1), np.eye(3)[None]]).reshape(-1, 9)

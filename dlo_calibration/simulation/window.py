@@ -4,8 +4,8 @@
 """
 Window: shows simulated motions in PyBullet's window, in real time.
 
-The window lives in a process of its own, because PyBullet ends its process where there is no screen,
-and when the window is closed.
+The window has a process of its own, because PyBullet ends its process if there is no screen, and when
+the window is closed.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from dlo_calibration.simulation.motion import hands_at, Motion
 from dlo_calibration.simulation.scene import read_scene
 
 FRAME_RATE = 30  # 1/s
-MOST_FRAMES = 3000  # of one motion: a longer one has fewer frames a second
+MOST_FRAMES = 3000  # of a motion; a longer motion has fewer frames per second
 PAUSE = 1.0  # s from the end of a motion to the start of the next
 MOST_BEADS = 300  # spheres that the DLO is drawn with
 HAND = 0.008  # m, half the edge of the cube that stands for a hand
@@ -42,7 +42,7 @@ class Film:
 
     :param name: shown beside it.
     :param times: (k,) [s], increasing.
-    :param beads: (k, b, 3) [m] points that are close together along the DLO.
+    :param beads: (k, b, 3) [m] closely spaced points along the DLO.
     :param hands: for each hand its colour (red, green, blue: 0 to 1), its (k, 3) positions [m], and (k,)
         whether it is closed.
     """
@@ -85,7 +85,7 @@ def show(films: Sequence[Film], radius: float, table: float | None, scene: str =
     here, there = spawn.Pipe()
     process = spawn.Process(target=_show, args=(there, films, radius, table, scene), daemon=True)
     process.start()
-    there.close()  # so that each process sees the end of the other one
+    there.close()  # so that each process notices the end of the other
     try:
         try:
             here.recv()
@@ -124,7 +124,7 @@ def _show(parent: Connection, films: Sequence[Film], radius: float, table: float
 
 
 class _Stage:
-    """The bodies in the window, enough for every film: adding or removing a body takes a frame."""
+    """The bodies in the window, enough for every film, because adding or removing a body takes a frame."""
 
     def __init__(self, client: int, films: Sequence[Film], radius: float, table: float | None) -> None:
         self._client = client
@@ -132,7 +132,7 @@ class _Stage:
         low, high = points.min(axis=0), points.max(axis=0)
         self._extent = max(0.1, float((high - low).max()))
         self._place = np.array([*(low + high)[:2] / 2, low[2] if table is None else table])
-        # While nothing is drawn, bodies are made much faster.
+        # Without rendering, bodies are made much faster.
         for what in (pybullet.COV_ENABLE_GUI, pybullet.COV_ENABLE_RENDERING):
             pybullet.configureDebugVisualizer(what, 0, physicsClientId=client)
         pybullet.resetDebugVisualizerCamera(self._extent, 0, -50, self._place.tolist(),
@@ -160,7 +160,7 @@ class _Stage:
 
     def show(self, film: Film, clock: Callable[[], float], sleep: Callable[[float], None],
              should_stop: Callable[[], bool]) -> bool:
-        """Show one motion in real time; tell whether to go on."""
+        """Show a motion in real time; return whether to go on."""
         self._name = pybullet.addUserDebugText(
             film.name, (self._place + (0, 0.6 * self._extent, 0.02)).tolist(), textColorRGB=[0, 0, 0],
             replaceItemUniqueId=self._name, physicsClientId=self._client)
@@ -170,16 +170,16 @@ class _Stage:
             if frame != shown:
                 self._show_frame(film, frame, shown)
                 shown = frame
-            if should_stop():  # the other process ended
+            if should_stop():  # the other process has ended
                 return False
             sleep(0.5 / FRAME_RATE)
         return True
 
     def _show_frame(self, film: Film, frame: int, before: int) -> None:
-        """Show a frame; `before` is the index of the one before, -1 for none."""
+        """Show a frame; `before` is the index of the previous frame, or -1."""
         points = film.beads[frame].tolist()
         for k, body in enumerate(self._beads):
-            self._move(body, points[min(k, len(points) - 1)])  # those left over hide in the last one
+            self._move(body, points[min(k, len(points) - 1)])  # surplus beads hide in the last one
         for k, body in enumerate(self._hands):
             if k >= len(film.hands):
                 self._move(body, [0.0, 0.0, -1e3])

@@ -25,9 +25,9 @@ from dlo_calibration.vision.tracer import Trace
 #: side, with bending stiffness EI and weight per length w (Euler-Bernoulli; no force, moment or slope where
 #: it leaves).  For ropes and cables this is 6 to 12 diameters.
 BUMP = 8.0  # diameters
-ENOUGH_POINTS = 1.5  # spacings of a chain that half a bump has at least, so that its curve can show it
-CLEARED = 2e-5  # m; a curve that comes so near to the wanted distance of two strands has it
-TURNS = 12  # of raising a chain's points, until its curve has that distance
+ENOUGH_POINTS = 1.5  # spacings of a chain in half a bump, at least, so that its curve can show it
+TOLERANCE = 2e-5  # m, of the distance between two crossing strands
+ITERATIONS = 12  # of raising a chain's points, at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class Axis:
 
     :param points: (n, 3) [m], first to last.
     :param sure: (n,) False where the photograph does not show it well.
-    :param over: (c, 2) arc lengths [m] at each crossing: of the upper and of the lower strand.
+    :param over: (c, 2) arc lengths [m] of the upper and the lower strand at each crossing.
     :param diameter: of the DLO [m].
     """
 
@@ -69,18 +69,18 @@ class Axis:
         """
         Return the chain of the points at fractions (m,) of the length.
 
-        Where its curve would let crossing strands come nearer than a diameter, because its points are too far
-        apart to show the bump, the points beside the crossing are raised.
+        The points beside a crossing are raised where they are too far apart to show the bump, so that the
+        crossing strands would come nearer than a diameter.
         """
         shares = np.asarray(fractions, float)
         chain = Chain(self.at(shares))
-        for _ in range(TURNS):
+        for _ in range(ITERATIONS):
             lack = self.diameter - self.clearances(chain, shares)
-            if not (lack > CLEARED).any():
+            if not (lack > TOLERANCE).any():
                 break
             points = chain.points.copy()
             for missing, (upper, _) in zip(lack, self.over / self.length, strict=True):
-                if missing > CLEARED:
+                if missing > TOLERANCE:
                     after = int(np.clip(np.searchsorted(shares, upper), 1, len(shares) - 1))
                     points[after - 1:after + 1, 2] += missing
             chain = Chain(points)
@@ -88,7 +88,7 @@ class Axis:
 
     def clearances(self, chain: Chain, fractions: ArrayLike) -> Floats:
         """
-        Return by how much the upper strand is above the lower one at each crossing, (c,) [m].
+        Return the height of the upper strand above the lower one at each crossing, (c,) [m].
 
         :param chain: of the points at `fractions` (m,) of the length.
         """
@@ -106,8 +106,8 @@ def axis_of(trace: Trace, scale: Scale, diameter: float, count: int,
     :param trace: its middle line in the photograph.
     :param diameter: of the DLO [m].
     :param count: number of points that its chain will have.
-    :param above: index of a crossing -> whether the strand that comes first along the DLO is the upper one.
-        Of a crossing that is not in it, the second strand is: who lays a DLO down lays the later part on top.
+    :param above: index of a crossing -> whether the first strand along the DLO is the upper one.  Elsewhere
+        the second one is: a person lays the later part on top.
     """
     radius = diameter / 2
     flat = scale.to_table(trace.pixels, radius)
@@ -127,24 +127,23 @@ def axis_of(trace: Trace, scale: Scale, diameter: float, count: int,
 def measured_diameter(trace: Trace, scale: Scale) -> float:
     """Return the diameter of a round DLO on the table from its width in the photograph [m]."""
     points = scale.to_table(trace.pixels)
-    ahead = np.gradient(points, axis=0)
-    aside = np.cross(ahead, scale.camera - points)
-    aside /= np.maximum(np.linalg.norm(aside, axis=1, keepdims=True), 1e-12)
+    normals = np.cross(np.gradient(points, axis=0), scale.camera - points)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     step = 5e-4  # m to either side
-    pixels = scale.to_pixels(points + step * aside) - scale.to_pixels(points - step * aside)
+    pixels = scale.to_pixels(points + step * normals) - scale.to_pixels(points - step * normals)
     return trace.width / float(np.nanmedian(np.linalg.norm(pixels, axis=1))) * 2 * step
 
 
 def bumps(along: Floats, over: Floats, diameter: float, least: float) -> Floats:
     """
-    Return how much higher than on the table a DLO is where it crosses itself, (n,) [m].
+    Return the height by which crossings lift a DLO, (n,) [m].
 
     A bump has the shape of a beam that is lifted at one point (see `BUMP`).  It ends before the strand passes
     below another one, where it lies on the table.
 
     :param along: (n,) arc lengths [m].
     :param over: (c, 2) arc lengths [m] of the upper and the lower strand at each crossing.
-    :param least: half length of a bump [m], if the place allows it.
+    :param least: half length of a bump [m], where there is room for it.
     """
     heights = np.zeros(len(along))
     for upper, _ in over:

@@ -35,8 +35,8 @@ CELLS = 6  # of a marker's side: 4 bits and a border
 MARKERS = COLUMNS * ROWS // 2  # one in each white square
 FEWEST_CORNERS = 8  # of 48: a third of the sheet, which still determines how it lies
 FEWEST_MARKERS = 3
-ENOUGH_CORNERS = 36  # with which no closer look is needed
-REDUCED = 1600  # px, of the longer side, for the first look for markers
+ENOUGH_CORNERS = 36  # that make the search in full resolution needless
+REDUCED = 1600  # px, of the longer side, for the first search for markers
 SMALLEST = 0.01  # perimeter of a marker, of the picture's longer side; OpenCV itself takes 0.03
 
 _ARUCO: Any = cv2.aruco  # of any version
@@ -74,8 +74,7 @@ def marker_squares() -> list[tuple[int, int]]:
 def marker_cells(number: int) -> Pixels:
     """Return the cells (6, 6) of a marker, 0 black and 255 white."""
     draw = _ARUCO.generateImageMarker if hasattr(_ARUCO, 'generateImageMarker') else _ARUCO.drawMarker
-    cells: Pixels = draw(_dictionary(), number, CELLS)
-    return cells
+    return np.asarray(draw(_dictionary(), number, CELLS))
 
 
 def find_board(pixels: Pixels, printed: float = RULER) -> tuple[Floats, Floats]:
@@ -113,7 +112,7 @@ def _dictionary() -> Any:
 
 
 def _detected(grey: Pixels) -> tuple[Any, Any]:
-    """Return the corners and numbers of markers, by the interface that OpenCV has: another one since 4.7."""
+    """Return the corners and numbers of markers; OpenCV has another interface since 4.7."""
     new = hasattr(_ARUCO, 'ArucoDetector')
     options = _ARUCO.DetectorParameters() if new else _ARUCO.DetectorParameters_create()
     options.minMarkerPerimeterRate = SMALLEST
@@ -139,12 +138,12 @@ def _corners(grey: Pixels, markers: dict[int, Floats]) -> tuple[Floats, Floats]:
     """
     Return the corners (k, 2) [px] between black squares, and their places (k, 2) [m].
 
-    Each marker gives the corners of its square, also where the lens bends the board. The estimates of the
+    Each marker gives the corners of its square, also where the lens bends the board.  The estimates of the
     markers beside a corner are averaged, and then moved to where the edges meet.
     """
     estimates: dict[tuple[int, int], list[Floats]] = defaultdict(list)
     sides: dict[tuple[int, int], list[float]] = defaultdict(list)
-    for number, seen in _agreeing(markers).items():
+    for number, seen in _consistent(markers).items():
         column, row = marker_squares()[number]
         view = cv2.getPerspectiveTransform(_square(INSET, INSET, MARKER), seen.astype(np.float32))
         corners = cv2.perspectiveTransform(_square(0.0, 0.0, SQUARE)[:, None], view).reshape(4, 2)
@@ -157,27 +156,27 @@ def _corners(grey: Pixels, markers: dict[int, Floats]) -> tuple[Floats, Floats]:
     meetings, places = [], []
     for place in sorted(estimates):
         side = min(sides[place])
-        corner = _met(grey, np.mean(estimates[place], axis=0), side)
+        corner = _refined(grey, np.mean(estimates[place], axis=0), side)
         if corner is not None and np.ptp(estimates[place], axis=0).max() < 0.2 * side:
             meetings.append(corner)
             places.append((place[0] * SQUARE, (ROWS - place[1]) * SQUARE))
-    return _smooth(np.array(meetings).reshape(-1, 2), np.array(places).reshape(-1, 2))
+    return _without_outliers(np.array(meetings).reshape(-1, 2), np.array(places).reshape(-1, 2))
 
 
-def _smooth(corners: Floats, places: Floats) -> tuple[Floats, Floats]:
-    """Return corners (k, 2) [px] and places (k, 2) [m] without those that something covers in part."""
+def _without_outliers(corners: Floats, places: Floats) -> tuple[Floats, Floats]:
+    """Return corners (k, 2) [px] and places (k, 2) [m] without corners that something partly covers."""
     if len(corners) < FEWEST_CORNERS:
         return corners, places
     view, _ = cv2.findHomography(places, corners, cv2.LMEDS)
     if view is None:
         return corners[:0], places[:0]
-    apart = np.linalg.norm(cv2.perspectiveTransform(places[:, None], view)[:, 0] - corners, axis=1)
-    kept = apart <= max(4.0 * float(np.median(apart)), 0.6)  # a lens that bends the board stays below
-    return corners[kept], places[kept]
+    errors = np.linalg.norm(cv2.perspectiveTransform(places[:, None], view)[:, 0] - corners, axis=1)
+    inliers = errors <= max(4.0 * float(np.median(errors)), 0.6)  # the distortion of a lens stays below
+    return corners[inliers], places[inliers]
 
 
-def _agreeing(markers: dict[int, Floats]) -> dict[int, Floats]:
-    """Return the markers that lie together as on the board; others were read from something else."""
+def _consistent(markers: dict[int, Floats]) -> dict[int, Floats]:
+    """Return the markers that lie together as on the board; the others are misreadings."""
     if len(markers) < FEWEST_MARKERS:
         return {}
     places = np.concatenate([_square(column * SQUARE + INSET, row * SQUARE + INSET, MARKER)
@@ -187,15 +186,15 @@ def _agreeing(markers: dict[int, Floats]) -> dict[int, Floats]:
     _, near = cv2.findHomography(places, seen, cv2.RANSAC, 0.25 * side)  # a lens may bend the board
     if near is None:
         return {}
-    # All four corners: those of a marker that was read from something else lie elsewhere, or are turned.
-    kept = near.reshape(-1, 4).all(axis=1)
-    if kept.sum() < FEWEST_MARKERS:
+    # All four corners: those of a misreading lie elsewhere, or are turned.
+    inliers = near.reshape(-1, 4).all(axis=1)
+    if inliers.sum() < FEWEST_MARKERS:
         return {}
-    return {number: marker for (number, marker), keep in zip(markers.items(), kept, strict=True) if keep}
+    return {number: marker for (number, marker), near in zip(markers.items(), inliers, strict=True) if near}
 
 
-def _met(grey: Pixels, corner: Floats, side: float) -> Floats | None:
-    """Return where black squares with some `side` [px] meet near a pixel (2,), or None."""
+def _refined(grey: Pixels, corner: Floats, side: float) -> Floats | None:
+    """Return where black squares of `side` px meet near a pixel (2,), to a fraction of a pixel, or None."""
     half = max(round(0.12 * side), 3)  # the markers' corners stay outside
     height, width = grey.shape
     if not (half + 2 < corner[0] < width - half - 3 and half + 2 < corner[1] < height - half - 3):
@@ -205,8 +204,9 @@ def _met(grey: Pixels, corner: Floats, side: float) -> Floats | None:
     piece = np.ascontiguousarray(grey[top:top + 4 * half + 9, left:left + 4 * half + 9])
     start = (corner - (left, top)).astype(np.float32).reshape(1, 1, 2)
     ends = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 0.005)
-    met: Floats = cv2.cornerSubPix(piece, start.copy(), (half, half), (-1, -1), ends).reshape(2) + (left, top)
-    return met if np.linalg.norm(met - corner) < max(half, 3.0) else None
+    places = cv2.cornerSubPix(piece, start.copy(), (half, half), (-1, -1), ends)
+    refined: Floats = places.reshape(2) + (left, top)
+    return refined if np.linalg.norm(refined - corner) < max(half, 3.0) else None
 
 
 def _square(left: float, top: float, side: float) -> Any:
@@ -289,7 +289,7 @@ def _draw_frame(axes: Any, left: float, bottom: float) -> None:
 
 
 def _draw_ruler(axes: Any, sheet: Paper) -> None:
-    """Draw the line of known length, and what to do with it."""
+    """Draw the line of known length, and the instructions."""
     begin, y = (sheet.width - RULER) / 2.0, 0.023
     ends = [(begin, 0.002), (begin + RULER, 0.002), (begin + RULER / 2.0, 0.001)]
     axes.plot([begin, begin + RULER], [y, y], color=DARK, lw=0.8, solid_capstyle='butt')

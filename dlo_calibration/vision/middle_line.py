@@ -4,13 +4,13 @@
 """
 The middle line of a DLO in the full resolution: between both of its edges, from one end to the other.
 
-A rough line is straightened: stations lie evenly along it, and at each, colours are read at offsets across.
-Each station chooses where the middle is, such that there are edges at half the width on both sides, that
-colours between them are the DLO's and those beside them are not, and that the choice changes little from
-station to station (dynamic programming).
+The photograph is straightened along a rough line: stations lie evenly along it, and at each, colours are
+read at offsets across.  Dynamic programming chooses the middle at each station: there are edges at half the
+width on both sides, the colours between them are the DLO's, those beside them are not, and the offset
+changes little from station to station.
 
-The outline of the DLO closes at its end, so that its edges there say nothing about the middle: the last part
-of the line goes on with the curvature before it, up to where the colours of the DLO end.
+The outline of the DLO closes at its end, so that its edges there say nothing about the middle: the line
+continues with the curvature before, up to the end of the DLO's colours.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ from dlo_calibration.model.chain import Floats
 from dlo_calibration.vision.ridge import Singles
 
 SPACING = 4.0  # px between stations, at least
-STATIONS = 800  # along a line, at most: more take time, and add nothing
+STATIONS = 800  # along a line, at most: more take time and add nothing
 HALVES = 0.5 * np.geomspace(0.3, 2.6, 26)  # of the rough width: half widths that are tried
 FAR = 2.6  # half widths: how far the strip reaches beside the line
 STEP = 0.04  # half widths between the offsets
 COLOUR = 0.2  # weight of colours; that of each edge is 1
-FIRST_COLOUR = 0.1  # that at first, when only the colours in the very middle of the DLO are known
+FIRST_COLOUR = 0.1  # weight in the first fit, which knows only the colours in the very middle of the DLO
 FULL = 0.9  # share of the usual strength from which on an edge counts fully
-TURNS = 3  # of straightening the strip anew
+ITERATIONS = 3  # of straightening the strip
 LEAST = 0.4  # mean logarithm of the odds below which a colour says nothing
 LOCAL = 3.0  # half widths, standard deviation of smoothing the local width along the line
-UNSEEN = 0.05  # what the width elsewhere counts there, where edges of the usual strength count 1
+UNSEEN = 0.05  # weight of the strip's own width; that of edges with the usual strength is 1
 DRIFT = 0.15  # cost of a change of the middle by one offset; that by two is four times as much
 BINS = (24, 40, 40)  # of L, a, b
 LOW, SIZE = (0.0, -100.0, -100.0), (100.0, 200.0, 200.0)
 DARKER = (0.9, 0.8, 0.65)  # L, a and b of the ground in shadows that take 25, 50 and 70 % of its light
 UNKNOWN = 2e-3  # share of either class that may have any colour
 MOST = 3.0  # limit of the logarithm of the odds
-STRANGE = 0.3  # is taken off: what looks like neither is not the DLO
+STRANGE = 0.3  # subtracted from the logarithm: a colour of neither class is not the DLO's
 SURE = 0.35  # quality below which the line is not sure
 SEEN = 1.0  # median logarithm of the odds from which on the DLO is not hidden
 BRIDGED = 1.6  # widths: a shorter gap between sure parts is sure, too
@@ -66,7 +66,7 @@ class Middle:
     :param quality: (n,) 1 where both edges and the colours are as usual, 0 where nothing is.
     :param edges: (n, 2) strength of both edges, 1 is usual.
     :param inside: (n,) mean logarithm of the odds that the middle has a colour of the DLO.
-    :param table: of these logarithms, as `strip.odds` reads it.
+    :param table: of these logarithms, as `odds` reads it.
     """
 
     line: Floats
@@ -77,50 +77,49 @@ class Middle:
     table: Singles
 
 
-def fit(pixels: NDArray[np.uint8], rough: Floats, width: float, known: bool, beyond: float) -> Middle:
+def fit(pixels: NDArray[np.uint8], rough: Floats, width: float, beyond: float) -> Middle:
     """
     Fit the middle line.
 
     :param pixels: (height, width, 3) RGB.
     :param rough: (k, 2) [px], at most about half a width beside the middle.
     :param width: rough width of the DLO [px].
-    :param known: the width is exact to a tenth.
-    :param beyond: by how much the line is prolonged at both ends, at least [px].
+    :param beyond: least length by which the line is prolonged at both ends [px].
     """
     least = max(SPACING, float(arc_lengths(rough)[-1]) / STATIONS)
     spacing = max(least, width / 10)
     line = smoothed(evenly(rough, spacing), 0.5 * width / spacing)
     line = prolonged(line, max(beyond, 2.2 * width), width)
-    line, half = _first(pixels, evenly(line, 2.0 * spacing), width, known)
+    line, half = _first_fit(pixels, evenly(line, 2.0 * spacing), width)
     spacing = max(least, half / 6)
     halves = np.full(len(line), half)
-    for turn in range(TURNS):
+    for iteration in range(ITERATIONS):
         arc = arc_lengths(line)
         line = evenly(line, spacing)
         halves = np.interp(np.linspace(0, arc[-1], len(line)), arc, halves)
         strip = straighten(pixels, line, halves, np.arange(-FAR, FAR + STEP / 2, STEP))
         along = 1.0 * half / spacing
-        strength = edges(strip, along * (0.6 if turn == 0 else 1.0))
+        strength = edges(strip, along * (0.6 if iteration == 0 else 1.0))
         table = learn_colours(strip, 0.75, (1.5, 2.4))
         colours = gaussian_filter1d(odds(table, strip.lab), along / 2, axis=0)
-        index = steady(_scores(strip, _evidence(strip, strength, colours), 1.0)[None], DRIFT)[0][0]
-        if turn < TURNS - 1:
-            halves = halves * _wider(strip, strength, index)
+        index = best_columns(_scores(strip, _evidence(strip, strength, colours), 1.0)[None], DRIFT)[0][0]
+        if iteration < ITERATIONS - 1:
+            halves = halves * _width_ratios(strip, strength, index)
             line = smoothed(strip.at(strip.offsets[index]), along)
-    return _exact(strip, strength, colours, index, along, table)
+    return _last_fit(strip, strength, colours, index, along, table)
 
 
-def steady(scores: Singles, drift: float) -> tuple[NDArray[np.int64], Floats]:
+def best_columns(scores: Singles, drift: float) -> tuple[NDArray[np.int64], Floats]:
     """
     Return the columns with the largest sum of scores in each matrix, and the means of these sums.
 
-    :param scores: (k, n, m): k matrices, of which each row gets a column.
-    :param drift: cost of a change by one column from row to row; that by two is four times as much, and more
-        is not possible.
+    :param scores: (k, n, m): k matrices; each of their rows gets a column.
+    :param drift: cost of a change by one column from row to row; a change by two, the largest possible,
+        costs four times as much.
     :returns: (k, n) and (k,).
     """
     count, rows, columns = scores.shape
-    changes = np.array([0, -1, 1, -2, 2])  # of columns that come to the same, the nearest counts
+    changes = np.array([0, -1, 1, -2, 2])  # among columns with equal sums, the nearest counts
     costs = drift * changes ** 2
     every = np.arange(count)
     totals = np.full((rows, count, columns + 4), -np.inf)  # largest sum to each column; two more at each side
@@ -151,26 +150,25 @@ def prolonged(line: Floats, by: float, width: float) -> Floats:
     return np.concatenate([ends[:1], line, ends[1:]])
 
 
-def _first(pixels: NDArray[np.uint8], line: Floats, width: float, known: bool) -> tuple[Floats, float]:
-    """Return a better line, and half the width, from among many."""
+def _first_fit(pixels: NDArray[np.uint8], line: Floats, width: float) -> tuple[Floats, float]:
+    """Return a better line, and half the width: the best of `HALVES`."""
     spacing = float(arc_lengths(line)[-1]) / (len(line) - 1)
-    halves = 0.5 * np.array([0.9, 0.95, 1.0, 1.05, 1.1]) if known else HALVES
-    reach = 1.7 * halves[-1] + 0.6
+    reach = 1.7 * HALVES[-1] + 0.6
     strip = straighten(pixels, line, np.full(len(line), width), np.arange(-reach, reach, 0.04))
     strength = edges(strip, 0.3 * width / spacing)
     table = learn_colours(strip, 0.2, (1.2, reach))
     colours = gaussian_filter1d(odds(table, strip.lab), 0.3 * width / spacing, axis=0)
     colours *= np.float32(FIRST_COLOUR / COLOUR)
     evidence = _evidence(strip, strength, colours)
-    indices, means = steady(np.stack([_scores(strip, evidence, half) for half in halves]), DRIFT)
+    indices, means = best_columns(np.stack([_scores(strip, evidence, half) for half in HALVES]), DRIFT)
     best = int(np.argmax(means))
     index = indices[best]
-    half = float(halves[best]) * width
+    half = float(HALVES[best]) * width
     return smoothed(strip.at(strip.offsets[index]), half / spacing), half
 
 
 def _evidence(strip: Strip, strength: Singles, colours: Singles) -> tuple[Singles, Singles]:
-    """Return the edges (n, m), of which one counts 1 at most, and the colours (n, m + 1) added up across."""
+    """Return the strength of edges (n, m), at most 1, and the sums of colours across (n, m + 1)."""
     # An edge counts fully from a share of the usual one on.
     saturated = np.minimum(strength / max(FULL * _usual(strip, strength), 1e-6), 1)
     return saturated, np.concatenate(
@@ -178,21 +176,19 @@ def _evidence(strip: Strip, strength: Singles, colours: Singles) -> tuple[Single
 
 
 def _scores(strip: Strip, evidence: tuple[Singles, Singles], half: float) -> Singles:
-    """Return how well each offset (n, m) is the middle of a DLO with a half width."""
+    """Return how well each offset (n, m) fits as the middle of a DLO with a half width."""
     saturated, sums = evidence
     step = strip.offsets[1] - strip.offsets[0]
     count = len(strip.offsets)
     middle = np.arange(count)
 
     def at(by: float) -> Singles:
-        scores: Singles = saturated[:, np.clip(middle + round(by / step), 0, count - 1)]
-        return scores
+        return np.asarray(saturated[:, np.clip(middle + round(by / step), 0, count - 1)])
 
     def between(low: float, high: float) -> Singles:
         first = np.clip(middle + round(low / step), 0, count - 1)
         last = np.clip(middle + round(high / step), 0, count - 1) + 1
-        mean: Singles = (sums[:, last] - sums[:, first]) / (last - first)
-        return mean
+        return np.asarray((sums[:, last] - sums[:, first]) / (last - first))
 
     inside = between(-0.85 * half, 0.85 * half)
     left, right = between(-1.7 * half, -1.15 * half), between(1.15 * half, 1.7 * half)
@@ -226,8 +222,8 @@ def _sides(strip: Strip, strength: Singles, index: NDArray[np.int64],
     return offsets, strengths
 
 
-def _wider(strip: Strip, strength: Singles, index: NDArray[np.int64]) -> Floats:
-    """Return by which factor (n,) the edges are further apart than the half widths say, changing evenly."""
+def _width_ratios(strip: Strip, strength: Singles, index: NDArray[np.int64]) -> Floats:
+    """Return the ratio (n,) of the edges' distance to the strip's width; its logarithm is linear in place."""
     (left, right), strengths = _sides(strip, strength, index)
     ratio = np.log(np.clip((right - left) / 2, 0.6, 1.6))
     place = strip.line - strip.line.mean(axis=0)
@@ -242,13 +238,13 @@ def _wider(strip: Strip, strength: Singles, index: NDArray[np.int64]) -> Floats:
     return np.exp(np.clip(terms @ coefficients, -0.3, 0.3))
 
 
-def _exact(strip: Strip, strength: Singles, colours: Singles, index: NDArray[np.int64], along: float,
-           table: Singles) -> Middle:
-    """Place both edges between the offsets, and smooth the middle where they are weak."""
+def _last_fit(strip: Strip, strength: Singles, colours: Singles, index: NDArray[np.int64], along: float,
+              table: Singles) -> Middle:
+    """Locate both edges between the offsets, and smooth the middle where they are weak."""
     half = np.ones(len(index))
     for _ in range(2):
         (left, right), (left_strength, right_strength) = _sides(strip, strength, index, half)
-        # A rope is wider here and narrower there; without evidence it is as wide as elsewhere.
+        # A rope's width varies; without evidence it is the strip's.
         trust = np.minimum(left_strength, right_strength) ** 2
         widths, trusts = (gaussian_filter1d(values, LOCAL * along, mode='nearest') + UNSEEN
                           for values in (trust * (right - left) / 2, trust))
@@ -259,7 +255,7 @@ def _exact(strip: Strip, strength: Singles, colours: Singles, index: NDArray[np.
     agrees = np.exp(-0.5 * ((right - left - 2 * half) / 0.25) ** 2)
     around = np.clip(index[:, None] + np.arange(-10, 11), 0, colours.shape[1] - 1)
     inside = np.take_along_axis(colours, around, axis=1).mean(axis=1, dtype=float)
-    # Through a shadow the edge of the colours is seen better than that of the light.
+    # In a shadow, the edge of the colours is clearer than that of the brightness.
     smooth = gaussian_filter1d(gaussian_filter1d(odds(table, strip.lab), along, axis=0), 1.0, axis=1)
     changes = np.abs(np.gradient(smooth, axis=1)).astype(np.float32)
     (left_seen, right_seen) = _sides(strip, changes, index, half)[1]
@@ -295,8 +291,7 @@ class Strip:
 
     def at(self, offsets: Floats) -> Floats:
         """Return the pixels (n, 2) at offsets (n,), one for each station."""
-        pixels: Floats = self.line + (offsets * self.half)[:, None] * self.normals
-        return pixels
+        return np.asarray(self.line + (offsets * self.half)[:, None] * self.normals)
 
 
 def arc_lengths(line: Floats) -> Floats:
@@ -321,8 +316,7 @@ def smoothed(values: Floats, sigma: float) -> Floats:
     """Return (n, ...) values smoothed along the first axis; the ends stay where they are."""
     reach = min(len(values) - 1, int(4 * sigma) + 1)
     padded = np.pad(values, [(reach, reach), (0, 0)][:values.ndim], 'reflect', reflect_type='odd')
-    smooth: Floats = gaussian_filter1d(padded, max(sigma, 1e-3), axis=0)[reach:reach + len(values)]
-    return smooth
+    return np.asarray(gaussian_filter1d(padded, max(sigma, 1e-3), axis=0)[reach:reach + len(values)])
 
 
 def straighten(pixels: NDArray[np.uint8], line: Floats, half: Floats, offsets: Floats) -> Strip:
@@ -353,8 +347,8 @@ def learn_colours(strip: Strip, inner: float, outer: tuple[float, float]) -> Sin
     """
     Return a table of the logarithm of the odds that a colour is the DLO's.
 
-    :param inner: offsets below this are taken as the DLO.
-    :param outer: offsets between these are taken as the ground; it may also be in shadow.
+    :param inner: offsets below this count as the DLO.
+    :param outer: offsets between these count as the ground, which may be in shadow, too.
     """
     far = np.abs(strip.offsets)
     of_dlo = _share(strip.lab[:, far <= inner].reshape(-1, 3))
@@ -363,14 +357,12 @@ def learn_colours(strip: Strip, inner: float, outer: tuple[float, float]) -> Sin
     of_ground = 0.6 * _share(outside) + 0.4 / len(DARKER) * shadows
     least = UNKNOWN * of_dlo.mean() + 1e-7
     logarithms: Singles = np.log((of_dlo + least) / (of_ground + least)).astype(np.float32).ravel()
-    limited: Singles = np.clip(logarithms - np.float32(STRANGE), -MOST, MOST)
-    return limited
+    return np.asarray(np.clip(logarithms - np.float32(STRANGE), -MOST, MOST))
 
 
 def odds(table: Singles, lab: Singles) -> Singles:
     """Return the logarithm of the odds (...) that colours (..., 3) are the DLO's."""
-    logarithms: Singles = table[_bin(lab)]
-    return logarithms
+    return np.asarray(table[_bin(lab)])
 
 
 def _bin(lab: Singles) -> NDArray[np.int64]:
@@ -383,8 +375,7 @@ def _bin(lab: Singles) -> NDArray[np.int64]:
 
 def _share(lab: Singles) -> Floats:
     counted = np.bincount(_bin(lab), minlength=BINS[0] * BINS[1] * BINS[2]).reshape(BINS).astype(float)
-    share: Floats = gaussian_filter(counted, 0.8) / max(len(lab), 1)
-    return share
+    return np.asarray(gaussian_filter(counted, 0.8) / max(len(lab), 1))
 
 
 def edges(strip: Strip, along: float) -> Singles:
@@ -395,8 +386,7 @@ def edges(strip: Strip, along: float) -> Singles:
     """
     smooth = cv2.GaussianBlur(strip.lab, (0, 0), sigmaX=1.0, sigmaY=max(along, 0.3),
                               borderType=cv2.BORDER_REPLICATE)
-    strength: Singles = np.linalg.norm(np.gradient(smooth, axis=1), axis=2).astype(np.float32)
-    return strength
+    return np.asarray(np.linalg.norm(np.gradient(smooth, axis=1), axis=2).astype(np.float32))
 
 
 def between_ends(pixels: NDArray[np.uint8], middle: Middle, clicks: Floats, near: float,
@@ -416,7 +406,7 @@ def between_ends(pixels: NDArray[np.uint8], middle: Middle, clicks: Floats, near
     for order in (1, -1):
         way = line[::order]
         arc = arc_lengths(way)
-        end = _end(arc, middle.inside[::order], _passed(way, arc, clicks[::order][0]), near)
+        end = _end(arc, middle.inside[::order], _arc_at(way, arc, clicks[::order][0]), near)
         if end is not None:
             line = _extended(way, arc, end, half)[::order]
     line = _bridged(line, sure, middle.inside, clicks, 2 * half)
@@ -424,7 +414,7 @@ def between_ends(pixels: NDArray[np.uint8], middle: Middle, clicks: Floats, near
     for order in (1, -1):
         way = line[::order]
         arc = arc_lengths(way)
-        click = _passed(way, arc, clicks[::order][0])
+        click = _arc_at(way, arc, clicks[::order][0])
         whole = float(arc[-1])
         way = evenly(way[:int(np.searchsorted(arc, click + near)) + 2], END_STEP * half)
         arc = arc_lengths(way)
@@ -437,7 +427,7 @@ def between_ends(pixels: NDArray[np.uint8], middle: Middle, clicks: Floats, near
         return np.empty((0, 2)), np.empty(0, dtype=bool), np.empty(0)
     at = np.linspace(ends[0], ends[1], round((ends[1] - ends[0]) / spacing) + 1)
     even = along_line(line, arc, at)
-    # An end is as sure as what is before it.
+    # An end is as sure as the part before it.
     quality = np.interp(np.clip(at, ends[0] + 1.5 * half, ends[1] - 1.5 * half), arc, middle.quality)
     certain = quality > SURE
     for first, last in gaps(certain):
@@ -446,7 +436,7 @@ def between_ends(pixels: NDArray[np.uint8], middle: Middle, clicks: Floats, near
     return even, certain, np.interp(at, arc, middle.edges.min(axis=1))
 
 
-def _passed(line: Floats, arc: Floats, click: Floats) -> float:
+def _arc_at(line: Floats, arc: Floats, click: Floats) -> float:
     """Return the arc length at which the first half of a line (n, 2) passes a click (2,) [px]."""
     # The line may pass the click again, elsewhere.
     distance = np.where(arc < arc[-1] / 2, np.linalg.norm(line - click, axis=1), np.inf)
@@ -454,7 +444,7 @@ def _passed(line: Floats, arc: Floats, click: Floats) -> float:
 
 
 def gaps(sure: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """List where the line is not sure: first index, and the one after the last."""
+    """List the parts where the line is not sure: first index, and the index after the last."""
     return [(part.start, part.stop) for part, in find_objects(label(~sure)[0])]
 
 
@@ -470,12 +460,12 @@ def _end(arc: Floats, inside: Floats, click: float, near: float) -> float | None
     first = int(np.argmax(total))
     if not 1 < first < len(window) - 1:
         return None
-    # Between the last station that is not the DLO and the next.
+    # Half-way between the last station beside the DLO and the first one on it.
     return float(arc[window[first]] + arc[window[first - 1]]) / 2
 
 
 def _edge(arc: Floats, part: Strip, near: float, reach: float) -> float:
-    """Return the arc length [px] of the strongest change of colour along a strip, within reach of one."""
+    """Return the arc length [px] of the strongest change of colour along a strip near `near`."""
     colour = gaussian_filter1d(part.lab.mean(axis=1), 1.0, axis=0)
     change = np.linalg.norm(np.diff(colour, axis=0), axis=1)
     between = (arc[:len(colour)][1:] + arc[:len(colour)][:-1]) / 2
@@ -506,21 +496,21 @@ def _extended(line: Floats, arc: Floats, end: float, half: float) -> Floats:
 def _beside_itself(line: Floats, arc: Floats, part: slice, width: float) -> bool:
     """Tell whether a part of a line (n, 2) lies beside another part of it, or across it."""
     places = np.arange(len(line))[part]
-    apart = np.abs(arc[places][:, None] - arc) > 3 * width
+    distant = np.abs(arc[places][:, None] - arc) > 3 * width
     near = np.linalg.norm(line[places][:, None] - line, axis=2) < 1.5 * width
-    return bool((apart & near).any())
+    return bool((distant & near).any())
 
 
 def _bridged(line: Floats, sure: NDArray[np.bool_], inside: Floats, clicks: Floats,
              width: float) -> Floats:
-    """Return a line (n, 2) that is smooth where the DLO is hidden, and goes through clicks there."""
+    """Return a line (n, 2) that is smooth where the DLO is hidden, and passes the clicks there."""
     bridged = line.copy()
     arc = arc_lengths(line)
     clicked = np.array([int(np.argmin(np.linalg.norm(line - click, axis=1))) for click in clicks])
     drawn = sure.copy()
     for first, last in gaps(sure):
-        # What has the DLO's colours is not hidden, however its edges look; but beside another strand the line
-        # may have strayed onto that.
+        # A part with the DLO's colours is not hidden, however its edges look; but beside another strand the
+        # line may have strayed onto that strand.
         drawn[first:last] = (arc[last - 1] - arc[first] <= HIDDEN * width or first == 0 or last == len(line)
                              or np.median(inside[first:last]) > SEEN
                              and not _beside_itself(line, arc, slice(first, last), width))

@@ -4,10 +4,9 @@
 """
 The path along a ridge, from click to click.
 
-Dijkstra's algorithm over states of pixel and direction; SciPy's would need the graph of all states, of which
-the path visits few.  A move costs more where the ridge is weak, and more
-where the direction changes, so that the way goes straight on at crossings; at a click the next part goes on
-in the directions in which the parts before it arrive.
+Dijkstra's algorithm over states of pixel and direction.  (SciPy's needs the graph of all states; this search
+visits few.)  A move costs more where the ridge is weak and where the direction changes, so that the path goes
+straight on at crossings.  At a click, the next part continues in the directions in which those before arrive.
 
 Every move costs at least 1, so all states of the frontier that cost less than 1 more than its cheapest are
 settled at once: they form a bucket as wide as the least cost (Dial, Algorithm 360: shortest-path forest with
@@ -30,19 +29,19 @@ MOVES = np.array([(1, 0), (2, 1), (1, 1), (1, 2), (0, 1), (-1, 2), (-1, 1), (-2,
 LENGTHS = np.sqrt((MOVES * MOVES).sum(axis=1))  # px
 _X, _Y = -MOVES[:, 1] / LENGTHS, MOVES[:, 0] / LENGTHS  # unit vectors across
 ACROSS = np.column_stack([_X * _X, 2 * _X * _Y, _Y * _Y])  # weights of the three second derivatives
-OFF = 25.0  # cost of a pixel of way off the ridge, where one on it costs 1
-STRONG = 0.55  # share of the ridge measure at the clicks that costs the least
-BEND = 0.6  # cost of a change of direction by a sixteenth of a turn; that by two is four times as much
+OFF = 25.0  # cost of a pixel off the ridge, where one on it costs 1
+STRONG = 0.55  # share of the ridge measure at the clicks from which on a move costs the least
+BEND = 0.6  # cost of a change of direction by a sixteenth of a turn; two sixteenths cost four times as much
 TURNS = np.arange(-2, 3)  # sixteenths of a turn, from one move to the next
-ASIDE = 1.0  # cost of each pixel between a click and the way
+ASIDE = 1.0  # cost of each pixel between a click and the path
 CROSSED = 40.0  # cost by which another arrival at a click may be worse than the best
-MOST = 2_500_000  # states that are settled, about two seconds: along a DLO these are 2 to 50 thousand
-EDGE = 2  # px around the ridge to which no way leads, as wide as the longest move
+MAXIMUM_STATES = 2_500_000  # to settle, about two seconds; along a DLO these are 2 to 50 thousand
+EDGE = 2  # px around the ridge that no path enters, as wide as the longest move
 
 
-def way(ridge: Ridge, clicks: Floats, reach: float) -> Floats:
+def ridge_path(ridge: Ridge, clicks: Floats, reach: float) -> Floats:
     """
-    Return the way (n, 2) [px of the photograph] along a ridge; it is empty if there is none.
+    Return the path (n, 2) [px of the photograph] along a ridge; empty: there is none.
 
     :param clicks: (k, 2) [px of the photograph], in order.
     :param reach: how far beside the DLO a click may be [px of the photograph].
@@ -55,29 +54,29 @@ def way(ridge: Ridge, clicks: Floats, reach: float) -> Floats:
 
 class _Search:
     """
-    The search for the way along a ridge.
+    The search for the path along a ridge.
 
     A ridge of H x W pixels gets an edge, so that it has P = (H + 4) (W + 4).  A state is d P + the pixel to
     which the move with the index d leads.
 
-    :param reach: how far a click may be from the way [px of the ridge].
+    :param reach: how far a click may be from the path [px of the ridge].
     """
 
     def __init__(self, ridge: Ridge, reach: float) -> None:
         self._reach = reach
         self._size = ridge.hessian.shape[1::-1]
         self._moves = _move_costs(ridge).ravel()  # of the move that leads to each state
-        self._cost = np.full_like(self._moves, np.inf)  # of the best way to each state
-        self._before = np.empty(len(self._moves), dtype=np.int8)  # direction before; -1: the way begins here
+        self._cost = np.full_like(self._moves, np.inf)  # of the best path to each state
+        self._before = np.empty(len(self._moves), dtype=np.int8)  # direction before; -1: the path begins here
         self._width = self._size[0] + 2 * EDGE
         self._pixels = len(self._moves) // len(MOVES)
         self._steps = MOVES @ (1, self._width)
         turned = (np.arange(len(MOVES))[:, None] + TURNS) % len(MOVES)
         self._after = turned * self._pixels + self._steps[turned]  # (16, 5) states minus the pixel before
-        self._left = MOST
+        self._budget = MAXIMUM_STATES
 
     def along(self, places: Floats) -> Floats:
-        """Return the pixels (n, 2) of the way along (k, 2) clicks [px of the ridge]."""
+        """Return the pixels (n, 2) of the path along (k, 2) clicks [px of the ridge]."""
         states, costs = self._around(places[0])
         parts = []
         for goal in places[1:]:
@@ -90,7 +89,7 @@ class _Search:
             if not arrived.any():
                 return np.empty((0, 2))
             states, costs = near[arrived], costs[arrived]
-        # Every part has several ways; the last click decides which counts.
+        # Every part has several paths; the last click decides which counts.
         visited, state = [], int(states[np.argmin(costs)])
         for reached, before in reversed(parts):
             while (direction := int(before[np.searchsorted(reached, state)])) >= 0:
@@ -101,7 +100,7 @@ class _Search:
         return np.column_stack([u, v]) - float(EDGE)
 
     def _around(self, place: Floats) -> tuple[Indices, Singles]:
-        """Return the states around a click, in all directions, and what each costs."""
+        """Return the states around a click, in all directions, and their costs."""
         span = np.arange(-int(self._reach) - 1, int(self._reach) + 2)
         x, y = np.meshgrid(*(np.round(place).astype(int)[:, None] + span))
         aside = np.hypot(x - place[0], y - place[1])
@@ -113,24 +112,26 @@ class _Search:
 
     def _settle(self, begins: Indices, costs: Singles, near: Indices, aside: Singles) -> Indices:
         """
-        Find the ways from one click to the next.
+        Find the paths from one click to the next.
 
-        :param begins: (s,) states at the first click; `costs`: theirs.
-        :param near: (e,) states at the next one; `aside`: what it costs to end there.
-        :returns: all states that were reached, in order.
+        :param begins: (s,) states at the first click.
+        :param costs: (s,) of those.
+        :param near: (e,) states at the next click.
+        :param aside: (e,) costs of ending there.
+        :returns: all reached states, sorted.
         """
         cost, before = self._cost, self._before
         cost[begins], before[begins] = costs, -1
         frontier, reached = begins, [begins]
-        while len(frontier) and self._left > 0:
+        while len(frontier) and self._budget > 0:
             keys = cost[frontier]
             least = keys.min()
             if least > (cost[near] + aside).min() + CROSSED:
                 break
             cheap = keys < least + 1
-            # The cheapest comes last: of ways that cost the same, what is written last stays.
+            # The cheapest comes last: among paths of the same cost, the last one written stays.
             bucket = frontier[cheap][np.argsort(keys[cheap])[::-1]]
-            self._left -= len(bucket)
+            self._budget -= len(bucket)
             direction, pixel = np.divmod(bucket, self._pixels)
             after = pixel[:, None] + self._after[direction]
             new = cost[bucket].astype(float)[:, None] + self._moves[after] + BEND * TURNS * TURNS
@@ -147,7 +148,7 @@ class _Search:
 
 
 def _move_costs(ridge: Ridge) -> Singles:
-    """Return what a move of each direction to each pixel costs (16, H + 4, W + 4); inf: to the edge."""
+    """Return the costs (16, H + 4, W + 4) of a move in each direction to each pixel; inf: to the edge."""
     height, width = ridge.hessian.shape[:2]
     costs = np.full((len(MOVES), height + 2 * EDGE, width + 2 * EDGE), np.inf, dtype=np.float32)
     floor = ridge.floor * 0.5

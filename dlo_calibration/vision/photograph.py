@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Photograph: the pixels of a JPEG or PNG file, upright, and what the camera wrote about its lens.
+Photograph: the upright pixels of a JPEG or PNG file, and its focal length if the camera wrote one.
 
-Uncompressed images in the encodings of ROS give the same pixels.
+An uncompressed ROS image is decoded to the same form.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Pixels = NDArray[np.uint8]
 MAXIMUM_OCTETS = 64 * 2**20  # of a file; a telephone's JPEG of 50 megapixels has a third
 MAXIMUM_PIXELS = 60_000_000
 MAXIMUM_SCANS = 100  # of a JPEG file, up to a tenth of a second each; a progressive one has about ten
-MAXIMUM_PROFILES = 100  # of a PNG file, a hundredth of a second each, unpacked as it is opened; it needs one
+MAXIMUM_PROFILES = 100  # of a PNG file, which needs one; opening it takes a hundredth of a second for each
 MAXIMUM_CHUNKS = 100_000  # of a PNG file, some microseconds each; encoders write one for 8 kB or more
 MINIMUM_SIDE = 100  # px; a DLO in a smaller picture is too thin to be found
 #: Diagonal of a frame of 35 mm film, 36 mm x 24 mm [mm]; 35 mm equivalents of focal lengths refer to it.
@@ -49,7 +49,7 @@ _SCAN, _END = b'\xff\xda', b'\xff\xd9'
 
 _ON_A_TELEPHONE = 'set the camera to its most compatible format (JPEG), or export the photograph as JPEG'
 _EXPORT = 'open it in a picture viewer and export it as JPEG'
-#: Place and bytes of a signature -> what the file is, and what to do.
+#: Place and bytes of a signature, the kind of file, and the remedy.
 _FOREIGN = (
     (8, (b'avif', b'avis'), 'an AVIF photograph', _EXPORT),
     (4, (b'ftyphei', b'ftyphev', b'ftypmif', b'ftypmsf'), 'a HEIC photograph', _ON_A_TELEPHONE),
@@ -75,7 +75,7 @@ ENCODINGS: dict[str, tuple[int, int | None]] = {
 SIXTEEN_BITS = ('mono16', '16UC1')
 
 JPEG_QUALITY = 90  # 0 to 100: no blocks to be seen around a thin DLO
-SMALLEST_WIDTH = 16  # px, of a picture that is asked for
+SMALLEST_WIDTH = 16  # px, of a reduced picture
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +110,7 @@ def read_photograph(source: Path | bytes, thing: str) -> Photograph:
     if octets.count(b'iCCP') > MAXIMUM_PROFILES:
         raise InputError(thing, f'a PNG file with more than {MAXIMUM_PROFILES} colour profiles', EXPECTED,
                          'export it again')
-    if _has_very_many_chunks(octets):
+    if _has_too_many_chunks(octets):
         raise InputError(thing, f'a PNG file with more than {MAXIMUM_CHUNKS} chunks', EXPECTED,
                          'export it again')
     try:
@@ -132,8 +132,8 @@ def read_photograph(source: Path | bytes, thing: str) -> Photograph:
 
 
 def _opened(octets: bytes, thing: str) -> Image:
-    """Return the picture of which only the head was read."""
-    # These two readers alone: the many others of Pillow are no use here, and more to attack.
+    """Open a picture; only its header is read."""
+    # Only these two readers: Pillow's many others are useless here, and can be attacked.
     for signature, reader in ((b'\xff\xd8\xff', JpegImageFile), (b'\x89PNG\r\n\x1a\n', PngImageFile)):
         if octets.startswith(signature):
             return reader(io.BytesIO(octets))
@@ -144,8 +144,8 @@ def _opened(octets: bytes, thing: str) -> Image:
     raise InputError(thing, came, EXPECTED, remedy)
 
 
-def _has_very_many_chunks(octets: bytes) -> bool:
-    """Return whether a PNG file consists of more chunks, which may be empty, than a reader should visit."""
+def _has_too_many_chunks(octets: bytes) -> bool:
+    """Tell whether a PNG file has more than `MAXIMUM_CHUNKS` chunks, which may be empty."""
     if not octets.startswith(b'\x89PNG'):
         return False
     place = 8
@@ -181,7 +181,7 @@ def _check_size(width: int, height: int, thing: str) -> None:
 
 
 def _colours(image: Image) -> Pixels:
-    """Return (h, w, 3) red, green, blue of a picture of any kind; what is transparent becomes white."""
+    """Return (h, w, 3) red, green, blue of a picture of any mode; transparent pixels become white."""
     if image.mode.startswith('I'):  # 16 bits of grey
         grey = np.asarray(image).astype(np.uint32, copy=False)
         return np.repeat((np.minimum(grey, 65535) >> 8).astype(np.uint8)[..., None], 3, axis=2)
@@ -205,15 +205,15 @@ def _camera_fields(image: Image) -> tuple[int, float | None]:
 
 def _focal_length(settings: dict[int, Any], width: int, height: int) -> float | None:
     """
-    Return the focal length [px] of a picture, from what is written in Exif's settings of the camera.
+    Return the focal length [px] of a picture from Exif's settings of the camera.
 
     The field FocalLengthIn35mmFilm is that of a camera for 35 mm film with the same angle of view
     over the diagonal (CIPA DCG-001).
     """
     length = float(settings.get(_FOCAL_LENGTH_IN_FILM) or 0.0)
-    taken = float(settings.get(_WIDTH) or width), float(settings.get(_HEIGHT) or height)
-    cut = abs(max(taken) / min(taken) * min(width, height) / max(width, height) - 1.0) > 0.01
-    if not 8.0 <= length <= 400.0 or cut:  # another picture was taken then
+    original = float(settings.get(_WIDTH) or width), float(settings.get(_HEIGHT) or height)
+    cropped = abs(max(original) / min(original) * min(width, height) / max(width, height) - 1.0) > 0.01
+    if not 8.0 <= length <= 400.0 or cropped:
         return None
     return length / FILM_DIAGONAL * math.hypot(width, height)
 
@@ -234,7 +234,7 @@ def decoded(thing: str, message: Any) -> Pixels:
     Return the pixels of a `sensor_msgs/msg/Image`: (h, w, 3) red, green, blue, 0 to 255.
 
     :param thing: what it is called in errors, e.g. ``image on /camera/image_raw``.
-    :raises InputError: if it has another encoding, or is not as long as it says.
+    :raises InputError: if its encoding is another one, or its length contradicts its size.
     """
     if message.encoding not in ENCODINGS:
         raise InputError(thing, f'encoding {message.encoding!r}',
@@ -261,8 +261,8 @@ def jpeg(photograph: Photograph, width: int | None = None) -> bytes:
     """
     Return a photograph as a JPEG file.
 
-    :param width: of the picture [px]; at most that of the photograph. None: that of the photograph.
-    :raises InputError: for a width that no picture has.
+    :param width: of the picture [px]; at most that of the photograph.  None: that of the photograph.
+    :raises InputError: for a width below `SMALLEST_WIDTH`.
     """
     pixels = photograph.pixels
     full_width, full_height = photograph.size
@@ -281,6 +281,6 @@ def png(pixels: Pixels) -> bytes:
 
 
 def _encoded(suffix: str, pixels: Pixels, option: int, value: int) -> bytes:
-    done, octets = cv2.imencode(suffix, cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), [option, value])
-    assert done
+    encoded, octets = cv2.imencode(suffix, cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), [option, value])
+    assert encoded
     return bytes(octets)

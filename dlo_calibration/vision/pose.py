@@ -4,9 +4,9 @@
 """
 Pose: where the camera stood, and its focal length, from points on the table.
 
-What is known before the points are seen goes in as an observation with its standard deviation: the focal
-length from a file or of an ordinary camera, and nearly no distortion (maximum a posteriori estimate).
-So a few points, which determine the lens poorly, leave it as it was, and a board's many corners correct it.
+The estimate is maximum a posteriori.  The prior is the focal length from a file or of an ordinary camera, and
+nearly no distortion: a few points, which determine the lens poorly, leave it there, and a board's many
+corners correct it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from scipy.optimize import least_squares
 
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.vision.camera import Lens
+from dlo_calibration.vision.lens import Lens
 from dlo_calibration.vision.photograph import FILM_DIAGONAL
 from dlo_calibration.vision.scale import Scale
 
@@ -38,8 +38,8 @@ DEVIATION_DISTORTION = 0.05  # of the first radial coefficient; cameras correct 
 MARKING = 0.0005  # of the picture's longer side: deviation of a person's marks, 2 px of 4000
 MARKS = 2.0  # weight of the above, in points, beside the residuals of the points
 MOST_RESIDUAL = 0.01  # of the points' extent; beyond it, something is wrong
-HEIGHT = 0.01  # m above the table, for which a note gives the error from the unknown focal length
-WORTH_TELLING = 2e-4  # m
+HEIGHT = 0.01  # m above the table, for which a warning gives the error from the unknown focal length
+NOTICEABLE = 2e-4  # m, such an error
 POOR = 2e-3  # m, a residual that careful marks stay below
 FEWEST = 4  # points that determine how a plane is seen (Hartley and Zisserman, Multiple View Geometry, 4.1)
 MOST = 1000
@@ -51,7 +51,7 @@ GENERAL = 0.01
 
 
 def scale_from_points(pixels: ArrayLike, table: ArrayLike, size: tuple[int, int], lens: Lens | None = None,
-                      focal_length: float | None = None, thing: str = 'scale') -> Scale:
+                      focal_length: float | None = None) -> Scale:
     """
     Return the scale of a photograph from points on its table.
 
@@ -60,29 +60,28 @@ def scale_from_points(pixels: ArrayLike, table: ArrayLike, size: tuple[int, int]
     :param size: width and height of the photograph [px].
     :param lens: of the camera, calibrated; or else
     :param focal_length: from the photograph's file [px].
-    :param thing: what the points are called in errors.
     :raises InputError: where they cannot be right.
     """
-    marked, places = check_points(pixels, table, size, thing)
-    lens = None if lens is None else lens.fitted(size, 'camera calibration')
+    marked, places = _check_points(pixels, table, size)
+    lens = None if lens is None else lens.resized(size)
     problem = _Problem(marked, places, size, lens, focal_length)
     for row in np.flatnonzero(np.isnan(problem.ideal).any(axis=1)):
-        raise InputError(f'{thing}, point {row + 1}', 'a pixel so far outside that its direction is unknown',
+        raise InputError(f'scale, point {row + 1}', 'a pixel so far outside that its direction is unknown',
                          'one that the camera calibration covers', 'mark a point nearer to the middle')
-    check_sides(problem.ideal, places, thing, lambda: _exchanged(problem))
+    _check_sides(problem.ideal, places, lambda: _exchanged(problem))
     scale, _ = problem.fit()
     extent = float(np.linalg.norm(np.ptp(places, axis=0)))
     if not scale.residual <= MOST_RESIDUAL * extent:
         raise InputError(
-            thing, f'points that miss their places on the table by {1e3 * scale.residual:.1f} mm (rms)',
-            f'at most {1e3 * MOST_RESIDUAL * extent:.1f} mm', _suspicion(problem, scale.residuals))
-    return replace(scale, notes=tuple(_notes(scale, len(marked))))
+            'scale', f'points that miss their places on the table by {1e3 * scale.residual:.1f} mm (rms)',
+            f'at most {1e3 * MOST_RESIDUAL * extent:.1f} mm', _remedy(problem, scale.residuals))
+    return replace(scale, warnings=tuple(_warnings(scale, len(marked))))
 
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
     """
-    Points (k, 2) [px] that are to be seen where points (k, 2) of the table are [m].
+    The pixels (k, 2) [px] of points, and their places (k, 2) on the table [m].
 
     The parameters are those of `Scale.parameters`, the last two only where no lens is given.
     """
@@ -159,7 +158,7 @@ class _Problem:
         return starts
 
     def _searched(self, start: Floats, deviation: float) -> Any:
-        """Search from parameters (p,), where the pixels have some standard deviation [px]."""
+        """Search from parameters (p,); the pixels have a standard deviation [px]."""
         return least_squares(
             lambda values: self._weighted(self._errors(values) / deviation, values), start,
             jac=lambda values: self._slopes(values, deviation), method='lm', x_scale='jac', max_nfev=200)
@@ -216,14 +215,14 @@ def _poses(view: Floats, middle: Floats) -> Iterator[tuple[Floats, Floats]]:
 
 
 def _exchanged(problem: _Problem) -> str:
-    """Return the sentence that names two points which were exchanged; empty if no two were."""
+    """Return the sentence that names two exchanged points; empty: there are none."""
     extent = float(np.linalg.norm(np.ptp(problem.table, axis=0)))
     count = min(len(problem.pixels), 10)
     fits = []
     for first, second in itertools.combinations(range(count), 2):
         other = problem.exchanged(first, second)
         try:
-            check_sides(other.ideal, other.table, '', lambda: '')
+            _check_sides(other.ideal, other.table, lambda: '')
         except InputError:
             continue
         scale, cost = other.fit()
@@ -232,95 +231,95 @@ def _exchanged(problem: _Problem) -> str:
     return 'points {1} and {2} seem to be exchanged'.format(*min(fits)) if fits else ''
 
 
-def _suspicion(problem: _Problem, residuals: Floats) -> str:
-    """Say which point of a bad solution is the likely reason."""
+def _remedy(problem: _Problem, residuals: Floats) -> str:
+    """Return the sentence that names the point to which a bad solution is probably due."""
     if sentence := _exchanged(problem):
         return sentence
     count = len(problem.pixels)
-    if 5 < count <= 12:  # as many remain as can contradict each other, and it takes no time
+    if 5 < count <= 12:  # the others can still contradict each other, and the search takes no time
         worst = min(range(count), key=lambda row: problem.without(row).fit()[0].residual)
     else:
         worst = int(np.argmax(residuals))
     return f'look at point {worst + 1} first, and check that all places are in metres'
 
 
-def _notes(scale: Scale, count: int) -> list[str]:
-    """Return what the user should know about a scale from `count` points."""
-    notes = []
+def _warnings(scale: Scale, count: int) -> list[str]:
+    """Return the warnings about a scale from `count` points."""
+    warnings = []
     length = scale.lens.matrix[0, 0]
     if not scale.focal_length_known:
         deviation = math.sqrt(scale.covariance[6, 6])
         film = length * FILM_DIAGONAL / math.hypot(*scale.size)
         estimated = deviation < 0.7 * DEVIATION_ORDINARY
-        where = 'found from the points' if estimated else 'that of an ordinary telephone'
-        notes.append(f'The focal length is not in the photograph: {film:.0f} mm of 35 mm film, give or take '
-                     f'{100 * deviation:.0f} %, is {where}.')
+        origin = 'found from the points' if estimated else 'that of an ordinary telephone'
+        warnings.append(f'The photograph does not contain its focal length, so it is {origin}: '
+                        f'{film:.0f} mm of 35 mm film, give or take {100 * deviation:.0f} %.')
     quarters = np.array(list(itertools.product((0.25, 0.75), repeat=2))) * scale.size
     error = float(np.median(scale.uncertainty(quarters, HEIGHT, above=0.0)))
-    if not error <= WORTH_TELLING:
-        notes.append(f'A point {1e3 * HEIGHT:.0f} mm above the table is placed with an error of about '
-                     f'{1e3 * error:.1f} mm: calibrate the camera if that is too much.')
+    if not error <= NOTICEABLE:
+        warnings.append(f'A point {1e3 * HEIGHT:.0f} mm above the table is placed with an error of about '
+                        f'{1e3 * error:.1f} mm: calibrate the camera if that is too much.')
     if scale.residual > POOR:
         worst = int(np.argmax(scale.residuals))
-        notes.append(f'The points miss their places by {1e3 * scale.residual:.1f} mm (rms), '
-                     f'point {worst + 1} by {1e3 * scale.residuals[worst]:.1f} mm: mark them again.')
+        warnings.append(f'The points miss their places by {1e3 * scale.residual:.1f} mm (rms), '
+                        f'point {worst + 1} by {1e3 * scale.residuals[worst]:.1f} mm: mark them again.')
     if count == 4:
-        notes.append('Four points fit nearly always, even if one is wrong: look at the grid, or mark five.')
-    return notes
+        warnings.append(
+            'Four points fit nearly always, even if one is wrong: check the grid, or mark a fifth one.')
+    return warnings
 
 
-def check_points(pixels: ArrayLike, table: ArrayLike, size: tuple[int, int],
-                 thing: str) -> tuple[Floats, Floats]:
+def _check_points(pixels: ArrayLike, table: ArrayLike, size: tuple[int, int]) -> tuple[Floats, Floats]:
     """
     Return the pixels (k, 2) and the places on the table (k, 2) [m] as arrays.
 
     :param size: width and height of the photograph [px].
-    :raises InputError: where they are too few, no numbers, outside, or nearly on one line.
+    :raises InputError: where they are too few or too many, no numbers, outside, or nearly on one line.
     """
     marked, places = (np.asarray(given, float) for given in (pixels, table))
     if marked.ndim != 2 or marked.shape[1:] != (2,) or marked.shape != places.shape:
-        raise InputError(thing, f'arrays of shape {marked.shape} and {places.shape}', PLACED,
+        raise InputError('scale', f'arrays of shape {marked.shape} and {places.shape}', PLACED,
                          'give as many of both')
     count = len(marked)
     if not FEWEST <= count <= MOST:
-        raise InputError(thing, f'{count} points', PLACED,
+        raise InputError('scale', f'{count} points', PLACED,
                          'mark more points' if count < FEWEST else 'mark fewer')
     for row, (pixel, place) in enumerate(zip(marked, places, strict=True), 1):
         if not np.isfinite(pixel).all() or not np.isfinite(place).all():
-            raise InputError(f'{thing}, point {row}', 'no finite number', PLACED, 'correct it')
+            raise InputError(f'scale, point {row}', 'no finite number', PLACED, 'correct it')
         if (pixel < -0.5).any() or (pixel > np.array(size) - 0.5).any():
-            raise InputError(f'{thing}, point {row}', f'the pixel {pixel[0]:g},{pixel[1]:g}',
+            raise InputError(f'scale, point {row}', f'the pixel {pixel[0]:g},{pixel[1]:g}',
                              f'a pixel of the photograph, {size[0]} x {size[1]}', 'mark it again')
     extent = float(np.linalg.norm(np.ptp(places, axis=0)))
     if not SMALLEST <= extent <= LARGEST:
-        raise InputError(thing, f'points on the table with an extent of {extent:.3g} m',
+        raise InputError('scale', f'points on the table with an extent of {extent:.3g} m',
                          f'{SMALLEST:g} m to {LARGEST:g} m', 'give their places in metres')
     if not (_general(places) and _general(marked)):
-        raise InputError(thing, 'points of which all, or all but one, are nearly on one line',
+        raise InputError('scale', 'points that are all, or all but one, nearly on one line',
                          'four points of which no three are on one line',
                          'mark points around the DLO, like the corners of a rectangle')
     return marked, places
 
 
-def check_sides(ideal: Floats, table: Floats, thing: str, exchanged: Callable[[], str]) -> None:
+def _check_sides(ideal: Floats, table: Floats, exchanged: Callable[[], str]) -> None:
     """
     Check that pixels without distortion (k, 2) show points of a table (k, 2) from above.
 
-    :param exchanged: returns a sentence that names two points which were exchanged, or an empty text.
+    :param exchanged: returns the sentence that names two exchanged points, or an empty text.
     :raises InputError: where the table is seen as in a mirror, or some points behind the camera.
     """
     matrix, _ = cv2.findHomography(table, ideal, 0)
     if matrix is None or not np.isfinite(matrix).all():
-        raise InputError(thing, 'points that no camera sees so', PLACED,
+        raise InputError('scale', 'pixels that fit no view of the places', PLACED,
                          exchanged() or 'check them one by one')
     depth = np.column_stack([table, np.ones(len(table))]) @ matrix[2]
     if depth.min() * depth.max() <= 0.0:
-        raise InputError(thing, 'points in an order in which no camera sees them',
+        raise InputError('scale', 'points in an order in which no camera sees them',
                          'the places on the table in the order of the pixels',
                          exchanged() or 'check the points one by one')
     # v points down in the picture, so that a table seen from above turns round (determinant below zero).
     if np.linalg.det(matrix) * depth[0] > 0.0:
-        raise InputError(thing, 'a table that is seen as in a mirror',
+        raise InputError('scale', 'a table that is seen as in a mirror',
                          'x and y such that, seen from above, y is x turned anticlockwise',
                          'change the sign of y, or check the order of the points')
 
@@ -333,8 +332,8 @@ def _general(points: Floats) -> bool:
     """
     centred = points - points.mean(axis=0)
     x, y = (centred / max(float(np.sqrt(np.square(centred).sum(axis=1).mean())), 1e-12)).T
-    zero, one = np.zeros_like(x), np.ones_like(x)
-    rows = np.concatenate([np.stack([x, y, one, zero, zero, zero, -x * x, -x * y, -x], axis=1),
-                           np.stack([zero, zero, zero, x, y, one, -y * x, -y * y, -y], axis=1)])
+    zeros, ones = np.zeros_like(x), np.ones_like(x)
+    rows = np.concatenate([np.stack([x, y, ones, zeros, zeros, zeros, -x * x, -x * y, -x], axis=1),
+                           np.stack([zeros, zeros, zeros, x, y, ones, -y * x, -y * y, -y], axis=1)])
     values = np.linalg.svd(rows, compute_uv=False)
     return bool(values[7] > GENERAL * values[0])

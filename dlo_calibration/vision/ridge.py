@@ -28,9 +28,9 @@ FINEST = 1000.0  # px, the longer side of the finest level
 COARSEST = 64.0  # px, of the coarsest
 BLUR = 1.0  # px of a level, standard deviation of the derivatives
 WIDTH = 3.2  # px of a level: the width of a DLO that is traced there
-NEAR = 14.0  # px in a photograph of 4000 px: how far beside the DLO somebody clicks
+NEAR = 14.0  # px in a photograph of 4000 px: usual distance of a click from the DLO
 STRONGEST = 0.85  # share of the strongest ridge that a wider level must have to be preferred
-KEPT = 0.8  # share of the pixels that may be the ground's
+GROUND = 0.8  # share of the pixels that count as the ground's
 ANGLES = np.arange(16) * (math.pi / 16)
 
 
@@ -97,27 +97,23 @@ def _level(reduced: NDArray[Any], factor: float) -> Level:
     for _ in range(2):
         # The DLO itself and its shadow do not count.
         size = np.einsum('ni,ij,nj->n', sample, np.linalg.inv(covariance), sample)
-        kept = sample[size <= np.quantile(size, KEPT)]
-        covariance = kept.T @ kept / len(kept) + 0.05 * np.eye(3)
+        ground = sample[size <= np.quantile(size, GROUND)]
+        covariance = ground.T @ ground / len(ground) + 0.05 * np.eye(3)
     inverse: Floats = np.linalg.inv(covariance).astype(float)
     return Level(factor, lab, curvature, inverse)
 
 
-def learn(levels: list[Level], clicks: Floats, width: float | None = None) -> Ridge:
+def learn(levels: list[Level], clicks: Floats) -> Ridge:
     """
     Choose the level, and the mixture of L, a and b, that separate the DLO at the clicks best from the ground.
 
     :param clicks: (k, 2) [px].
-    :param width: of the DLO [px], if it is known.
     """
-    tried = [_at_clicks(level, clicks) for level in levels]
-    if width is None:
-        # A bar's ridge is the strongest where its width is twice the blur; one level finer is more exact.
-        strengths = np.array([np.linalg.norm(mean) for _, _, mean in tried])
-        chosen = max(0, int(np.nonzero(strengths >= STRONGEST * strengths.max())[0][-1]) - 1)
-    else:
-        chosen = int(np.argmin([abs(math.log(WIDTH * level.factor / width)) for level in levels]))
-    level, (weights, typical, _) = levels[chosen], tried[chosen]
+    measures = [_at_clicks(level, clicks) for level in levels]
+    # A bar's ridge is the strongest where its width is twice the blur; one level finer is more exact.
+    strengths = np.array([np.linalg.norm(mean) for _, _, mean in measures])
+    chosen = max(0, int(np.nonzero(strengths >= STRONGEST * strengths.max())[0][-1]) - 1)
+    level, (weights, typical, _) = levels[chosen], measures[chosen]
     hessian = level.curvature @ (weights / typical).astype(np.float32)
     half = (hessian[..., 0] + hessian[..., 2]) / 2
     largest = half + np.hypot((hessian[..., 0] - hessian[..., 2]) / 2, hessian[..., 1])
@@ -126,7 +122,7 @@ def learn(levels: list[Level], clicks: Floats, width: float | None = None) -> Ri
 
 
 def _at_clicks(level: Level, clicks: Floats) -> tuple[Floats, float, Floats]:
-    """Return the weights of L, a, b, what they give in the DLO's middle, and the mean derivative there."""
+    """Return the weights of L, a, b, their response in the DLO's middle, and the mean derivative there."""
     height, width = level.lab.shape[:2]
     reach = NEAR / 4000 * max(height, width) + 1.0
     across = np.column_stack([np.cos(ANGLES) ** 2, 2 * np.cos(ANGLES) * np.sin(ANGLES), np.sin(ANGLES) ** 2])
@@ -136,16 +132,16 @@ def _at_clicks(level: Level, clicks: Floats) -> tuple[Floats, float, Floats]:
         top, bottom = max(0, int(v - reach)), min(height, int(v + reach) + 2)
         part = level.curvature[top:bottom, left:right].astype(float)
         y, x = np.mgrid[top:bottom, left:right]
-        far = np.hypot(x - u, y - v)
-        inside = far <= max(reach, float(far.min()))
+        distance = np.hypot(x - u, y - v)
+        inside = distance <= max(reach, float(distance.min()))
         turned = np.einsum('ak,nkc->nac', across, part[inside])
-        # What is along the line does not count: a speck has as much of it as across.
+        # The derivative along the line is subtracted: a speck has as much along as across.
         along = np.roll(turned, len(ANGLES) // 2, axis=1)
-        weight = np.exp(-0.5 * (far[inside] / reach) ** 2)[:, None]
+        weight = np.exp(-0.5 * (distance[inside] / reach) ** 2)[:, None]
         candidates.append((turned, along, weight))
 
     def pick(weights: Floats | None) -> Floats:
-        """Return the most outstanding vector (3,) at each click."""
+        """Return the vector (3,) of the strongest ridge at each click."""
         picked = []
         for turned, along, weight in candidates:
             if weights is None:

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Scale: where on the table, or above it, the point lies that a pixel shows.
+Scale: the point on the table, or above it, that a pixel shows.
 
 The table is the plane z = 0 of the trial's frame: x and y lie on it, z points up, and seen from above
 y is x turned anticlockwise.  The frame of the camera is OpenCV's: x to the right, y down, z into the scene.
@@ -19,14 +19,14 @@ from numpy.typing import ArrayLike
 
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.chain import Floats, frozen_array
-from dlo_calibration.vision.camera import Lens
+from dlo_calibration.vision.lens import Lens
 
 SPACINGS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # m
-LINES = 12  # across the longer side of the picture; so many can be distinguished
+LINES = 12  # across the longer side of the picture: these can still be distinguished
 FARTHEST = 3.0  # heights of the camera, from the point below it: beyond, a table is hardly seen
-SAMPLES = 2000  # of each line, which ends at the border with this resolution
-KEPT = 25  # of them at most, as a lens bends lines only a little
-RASTER = 50  # pixels across and down the picture, where the table is looked for
+SAMPLES = 2000  # of each line: the resolution with which it ends at the border
+POINTS = 25  # of each line that are returned, at most: a lens bends lines only a little
+RASTER = 50  # pixels across and down the picture at which the table is sampled
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +39,8 @@ class Scale:
     :param translation: (3,) the table's origin in the camera's frame [m].
     :param residuals: (k,) distance on the table between each given point and where its pixel is [m].
     :param focal_length_known: False: neither a calibration nor the photograph's file has it.
-    :param notes: sentences for the user: what was assumed, and what that may cost.
-    :param covariance: (p, p) of `parameters`, of which the first p are uncertain.
+    :param warnings: sentences for the user: the assumptions, and the errors that they may cause.
+    :param covariance: (p, p) of the first p of `parameters`; the others are exact.
     """
 
     lens: Lens
@@ -48,7 +48,7 @@ class Scale:
     translation: Floats
     residuals: Floats
     focal_length_known: bool
-    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     covariance: Floats = field(default_factory=lambda: np.zeros((0, 0)))
 
     def __post_init__(self) -> None:
@@ -68,13 +68,7 @@ class Scale:
     @property
     def camera(self) -> Floats:
         """Place of the camera (3,) in the table's frame [m]."""
-        place: Floats = -self.rotation.T @ self.translation
-        return place
-
-    @property
-    def tilt(self) -> float:
-        """Angle between the direction in which the camera looks and straight down [rad]."""
-        return math.acos(min(max(-float(self.rotation[2, 2]), -1.0), 1.0))
+        return np.asarray(-self.rotation.T @ self.translation)
 
     def to_table(self, pixels: ArrayLike, height: ArrayLike = 0.0) -> Floats:
         """
@@ -87,19 +81,19 @@ class Scale:
         0.8 m away.
 
         :param height: of all points, or (n,) of each [m].
-        :raises InputError: where a pixel shows no such point, as it is above the horizon.
+        :raises InputError: for a pixel above the horizon.
         """
         seen = np.asarray(pixels, float).reshape(-1, 2)
         points = self.points(seen, height)
         bad = np.flatnonzero(np.isnan(points).any(axis=1))
         if len(bad):
             u, v = seen[bad[0]]
-            raise InputError(f'pixel {u:.0f},{v:.0f}', 'a place above the horizon of the table, by the scale',
+            raise InputError(f'pixel {u:.0f},{v:.0f}', 'a place above the horizon of the table',
                              'a place on the table', 'check the points of the scale')
         return points
 
     def points(self, pixels: ArrayLike, height: ArrayLike = 0.0) -> Floats:
-        """Do what `to_table` does, with points that are not a number for pixels above the horizon."""
+        """Return what `to_table` returns, with not a number for pixels above the horizon."""
         ideal = self.lens.undistorted(pixels)
         directions = np.linalg.inv(self.lens.matrix).T @ self.rotation
         rays = np.column_stack([ideal, np.ones(len(ideal))]) @ directions
@@ -172,8 +166,7 @@ def grid(scale: Scale) -> list[tuple[str, Floats]]:
     """
     Return the lines of the table that a photograph shows; none if it shows no table.
 
-    :returns: what is written beside each, e.g. ``x 0.10``, where x is the same everywhere on it [m]; and its
-        pixels (n, 2).
+    :returns: the label of each, e.g. ``x 0.10`` for the line x = 0.10 m, and its pixels (n, 2).
     """
     table = _seen(scale)
     if len(table) < 3:
@@ -193,14 +186,13 @@ def grid(scale: Scale) -> list[tuple[str, Floats]]:
 
 
 def _seen(scale: Scale) -> Floats:
-    """Return points (n, 2) of the table all over the picture, if they are not too far away [m]."""
+    """Return points (n, 2) of the table all over the picture, without those too far away [m]."""
     width, height = scale.size
     across, down = np.linspace(0.0, width - 1.0, RASTER), np.linspace(0.0, height - 1.0, RASTER)
     u, v = np.meshgrid(across, down)
     points = scale.points(np.stack([u.ravel(), v.ravel()], axis=1))[:, :2]
     far = FARTHEST * abs(float(scale.camera[2]))
-    near: Floats = points[np.linalg.norm(points - scale.camera[:2], axis=1) <= far]
-    return near
+    return np.asarray(points[np.linalg.norm(points - scale.camera[:2], axis=1) <= far])
 
 
 def _within(scale: Scale, points: Floats) -> list[Floats]:
@@ -212,5 +204,5 @@ def _within(scale: Scale, points: Floats) -> list[Floats]:
     changes = np.flatnonzero(np.diff(inside.astype(int)))
     pieces = np.split(pixels, changes + 1)
     starts = inside[np.concatenate([[0], changes + 1])]
-    return [piece[np.unique(np.linspace(0, len(piece) - 1, KEPT).astype(int))]
-            for piece, kept in zip(pieces, starts, strict=True) if kept and len(piece) > 1]
+    return [piece[np.unique(np.linspace(0, len(piece) - 1, POINTS).astype(int))]
+            for piece, visible in zip(pieces, starts, strict=True) if visible and len(piece) > 1]

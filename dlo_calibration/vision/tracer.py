@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter1d
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.vision.middle_line import arc_lengths, between_ends, evenly, fit
-from dlo_calibration.vision.path import way
+from dlo_calibration.vision.path import ridge_path
 from dlo_calibration.vision.photograph import Pixels
 from dlo_calibration.vision.ridge import learn, levels
 from dlo_calibration.writing import whole
@@ -25,7 +25,7 @@ NEAR_END = 40.0  # px in a photograph of 4000 px: how far from the DLO's end the
 CLICK = 16.0  # px in a photograph of 4000 px: how far beside the DLO a click may be
 SPACING = 3.0  # px between the points of a trace, in a photograph of 4000 px
 SEEN = 0.3  # share of the line that must be sure, else there is no DLO
-ABOVE = 1.35  # times as strong are the edges of the strand that lies above
+ABOVE = 1.35  # least ratio of the upper strand's edge strength to the lower one's
 LINE, UNSURE, POINTS = (0, 220, 255), (255, 60, 0), (255, 255, 0)  # red, green, blue
 OUTLINE = (0, 0, 0)
 
@@ -38,7 +38,7 @@ class Crossing:
     :param pixel: u, v [px].
     :param first: arc length along the trace at the first passage [px].
     :param second: and at the second.
-    :param first_above: whether the photograph suggests that the first is above; None: it does not show it.
+    :param first_above: whether the first passage seems to be above; None: the photograph does not show it.
     """
 
     pixel: tuple[float, float]
@@ -75,29 +75,28 @@ class Tracer:
         self._pixels = np.ascontiguousarray(pixels)
         self._levels = levels(self._pixels)
 
-    def trace(self, clicks: ArrayLike, *, width: float | None = None) -> Trace:
+    def trace(self, clicks: ArrayLike) -> Trace:
         """
         Trace the DLO along clicks.
 
         The line ends at the DLO's end if the first or last click is near one, else at the click.
 
         :param clicks: (k, 2) [px], k >= 2, in order along the DLO, each at most some 16 px beside it.
-        :param width: of the DLO [px], if it is known.
         :raises InputError: if there are fewer than two clicks, one is outside the photograph, or there is no
             DLO along them.
         """
         places = self._checked(clicks)
         scale = max(self._pixels.shape[:2]) / 4000
-        ridge = learn(self._levels, places, width)
-        rough = way(ridge, places, max(CLICK * scale, 3.0))
+        ridge = learn(self._levels, places)
+        rough = ridge_path(ridge, places, max(CLICK * scale, 3.0))
         if len(rough) < 2:
-            raise _nothing()
+            raise _no_dlo()
         near = max(NEAR_END * scale, 2 * ridge.width)
-        middle = fit(self._pixels, rough, ridge.width if width is None else width, width is not None, near)
+        middle = fit(self._pixels, rough, ridge.width, near)
         line, sure, strength = between_ends(self._pixels, middle, places, NEAR_END * scale,
                                             max(SPACING * scale, 1.0))
         if len(line) < 3 or sure.mean() < SEEN:
-            raise _nothing()
+            raise _no_dlo()
         size = 2 * float(np.median(middle.half))
         return Trace(frozen_array(line), frozen_array(sure, bool), size,
                      tuple(_crossings(line, strength, size)))
@@ -114,15 +113,14 @@ class Tracer:
             raise InputError(f'click {k + 1}', f'{places[k][0]:g},{places[k][1]:g}',
                              f'a pixel of the photograph, which is {width} x {height}',
                              'click on the DLO in the photograph')
-        kept = np.concatenate([[True], np.linalg.norm(np.diff(places, axis=0), axis=1) > 1])
-        if kept.sum() < 2:
+        distinct = np.concatenate([[True], np.linalg.norm(np.diff(places, axis=0), axis=1) > 1])
+        if distinct.sum() < 2:
             raise InputError('clicks', 'all at one place', 'at least two places',
                              'click on both ends of the DLO')
-        inside: Floats = np.clip(places[kept], 0, (width - 1, height - 1))
-        return inside
+        return np.asarray(np.clip(places[distinct], 0, (width - 1, height - 1)))
 
 
-def _nothing() -> InputError:
+def _no_dlo() -> InputError:
     return InputError('clicks', 'nothing along them that looks the same from end to end', 'clicks on a DLO',
                       'click on both ends of the DLO, and on its bends, in order')
 
@@ -158,7 +156,7 @@ def write_picture(path: Path, pixels: Pixels, trace: Trace, points: Floats | Non
     """
     Write a photograph as PNG with its line; unsure parts have another colour.
 
-    :param points: (n, 2) [px] of the chain's points, which become dots; None: there are none.
+    :param points: (n, 2) [px] of the chain, drawn as dots; None: none are drawn.
     :raises InputError: where the file cannot be written.
     """
     image = Image.fromarray(pixels)

@@ -28,14 +28,14 @@ from dlo_calibration.vision.tracer import Trace
 STATIONS = 120  # of each line, for the assignment
 KNOTS = 24  # of the curve
 SAMPLES = 240  # of the curve, that are compared with the lines
-TURNS = 12  # of the fit
+ITERATIONS = 12  # of the fit
 LEAST_ANGLE = math.radians(20)  # between the two views; nearer ones make heights several times less exact
 EXACT = 3e-4  # m, deviation of a line
 SMOOTH = 4e-3  # m, third difference of neighbouring knots, as of a bend whose radius changes within 0.1 m
-BELOW = 8e-3  # m below the table; no place there is one of the DLO
-FARTHEST = 4e-3  # m between the curve and the lines (root mean square); beyond, they do not belong together
+BELOW = 8e-3  # m below the table; deeper places are not the DLO's
+FARTHEST = 4e-3  # m between the curve and the lines (root mean square), at most
 REMEDY = 'check both lines and scales, and that the DLO did not move between the photographs'
-ENDS = 0.012  # m between the rays to an end of the DLO, likewise
+ENDS = 0.012  # m between the rays to an end of the DLO, at most
 
 
 def axis_of_two_views(first: Trace, first_scale: Scale, second: Trace, second_scale: Scale,
@@ -53,17 +53,18 @@ def axis_of_two_views(first: Trace, first_scale: Scale, second: Trace, second_sc
     lines = [along_line(trace.pixels, along, np.linspace(0.0, along[-1], SAMPLES))
              for trace, along in ((first, arc_lengths(first.pixels)), (second, arc_lengths(second.pixels)))]
     _check_views(lines, scales)
-    begun = [_assigned(lines[0], line, scales) for line in (lines[1], lines[1][::-1])]
-    if begun[1][1] < begun[0][1]:
-        lines[1] = lines[1][::-1]
+    knots, cost = _assigned(lines[0], lines[1], scales)
+    reversed_knots, reversed_cost = _assigned(lines[0], lines[1][::-1], scales)
+    if reversed_cost < cost:
+        knots, lines[1] = reversed_knots, lines[1][::-1]
     _check_ends(lines, scales)
-    points, deviation = _fitted(begun[int(begun[1][1] < begun[0][1])][0], lines, scales)
+    points, deviation = _fitted(knots, lines, scales)
     if deviation > FARTHEST:
         raise InputError('second photograph', f'a line that misses the other by {1000 * deviation:.0f} mm',
                          f'at most {1000 * FARTHEST:.0f} mm', REMEDY)
     lowest = float(points[:, 2].min())
     if lowest < -BELOW:
-        raise InputError('second photograph', f'a line by which the DLO is {-1000 * lowest:.0f} mm below the '
+        raise InputError('second photograph', f'a line that puts the DLO {-1000 * lowest:.0f} mm below the '
                          'table', 'a DLO on or above it', REMEDY)
     points[:, 2] = np.maximum(points[:, 2], diameter / 2)  # it lies on the table, not in it
     places = np.linspace(0.0, 1.0, len(points))
@@ -96,7 +97,6 @@ def _check_ends(lines: Sequence[Floats], scales: Sequence[Scale]) -> None:
 
 def _rays(pixels: Floats, scale: Scale) -> tuple[Floats, Floats]:
     """Return the camera's place (3,) [m] and the unit directions (n, 3) that pixels (n, 2) show."""
-    # Two heights below the camera: a pixel may show nothing of the table itself.
     camera = scale.camera
     ideal = scale.lens.undistorted(pixels)
     seen = np.column_stack([ideal, np.ones(len(ideal))]) @ np.linalg.inv(scale.lens.matrix).T
@@ -104,13 +104,13 @@ def _rays(pixels: Floats, scale: Scale) -> tuple[Floats, Floats]:
     return camera, directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-def _meeting(one: tuple[Floats, Floats], other: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
+def _meeting(rays: tuple[Floats, Floats], other: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
     """
     Return where rays meet: the middles (..., 3) between their nearest points, and the gaps there (...) [m].
 
-    :param one: a camera's place (3,) and directions (..., 3), likewise `other`; they are broadcast.
+    :param rays: a camera's place (3,) and directions (..., 3), likewise `other`; they are broadcast.
     """
-    (camera, u), (camera_2, v) = one, other
+    (camera, u), (camera_2, v) = rays, other
     between = camera_2 - camera
     cosine = (u * v).sum(axis=-1)
     sine = np.maximum(1.0 - cosine**2, 1e-9)
@@ -123,11 +123,7 @@ def _meeting(one: tuple[Floats, Floats], other: tuple[Floats, Floats]) -> tuple[
 
 
 def _assigned(first: Floats, second: Floats, scales: Sequence[Scale]) -> tuple[Floats, float]:
-    """
-    Return points (KNOTS, 3) [m] where the rays of two lines (n, 2) meet best, in order, and how well.
-
-    The lower the second value, the better.
-    """
+    """Return points (KNOTS, 3) [m] where the rays of two lines (n, 2) meet best, in order, and their cost."""
     chosen = np.linspace(0, len(first) - 1, STATIONS).round().astype(int)
     rays = [_rays(line[chosen], scale) for line, scale in zip((first, second), scales, strict=True)]
     points, gaps = _meeting((rays[0][0], rays[0][1][:, None]), (rays[1][0], rays[1][1][None, :]))
@@ -136,7 +132,7 @@ def _assigned(first: Floats, second: Floats, scales: Sequence[Scale]) -> tuple[F
     for i in range(STATIONS):
         for j in range(STATIONS):
             best, way = (0.0, 0) if i == j == 0 else (np.inf, 0)
-            # A step of both at once counts twice, as it covers as much of the lines as two others.
+            # A diagonal step counts twice: it covers as much of the lines as two others.
             for k, (di, dj, weight) in enumerate(((1, 1, 2.0), (1, 0, 1.0), (0, 1, 1.0))):
                 if i >= di and j >= dj and i + j > 0 and total[i - di, j - dj] + weight * cost[i, j] < best:
                     best, way = total[i - di, j - dj] + weight * cost[i, j], k
@@ -157,24 +153,23 @@ def _fitted(knots: Floats, lines: Sequence[Floats],
     """
     Return the curve that both photographs show as lines (n, 2).
 
-    :returns: (SAMPLES, 3) [m]; and how far it misses the lines (root mean square) [m].
-
     Gauss-Newton with the nearest points of the lines; third differences of the knots are penalised.
+
+    :returns: (SAMPLES, 3) [m], and its deviation from the lines (root mean square) [m].
     """
     weights = CubicSpline(np.linspace(0.0, 1.0, KNOTS), np.eye(KNOTS))(np.linspace(0.0, 1.0, SAMPLES))
     rough = np.kron(np.diff(np.eye(KNOTS), 3, axis=0), np.eye(3)) / SMOOTH
     trees = [cKDTree(line) for line in lines]
     deviation = math.inf
-    for _ in range(TURNS):
+    for _ in range(ITERATIONS):
         curve = weights @ knots
         rows, wanted, missed = [rough], [-rough @ knots.ravel()], []
         for line, scale, tree in zip(lines, scales, trees, strict=True):
-            slopes, offsets, apart = _offsets(curve, line, scale, tree)
+            slopes, offsets, (end_slopes, gaps) = _offsets(curve, line, scale, tree)
             rows.append(np.einsum('sc,sk->skc', slopes, weights).reshape(SAMPLES, -1) / EXACT)
             wanted.append(-offsets / EXACT)
             missed.append(offsets)
-            ends, gaps = apart
-            rows.append(np.einsum('eac,ek->eakc', ends, weights[[0, -1]]).reshape(4, -1) / EXACT)
+            rows.append(np.einsum('eac,ek->eakc', end_slopes, weights[[0, -1]]).reshape(4, -1) / EXACT)
             wanted.append(-gaps.ravel() / EXACT)
         change = np.linalg.lstsq(np.concatenate(rows), np.concatenate(wanted), rcond=None)[0]
         knots = knots + change.reshape(-1, 3)
@@ -187,7 +182,7 @@ def _fitted(knots: Floats, lines: Sequence[Floats],
 def _offsets(curve: Floats, line: Floats, scale: Scale,
              tree: cKDTree) -> tuple[Floats, Floats, tuple[Floats, Floats]]:
     """
-    Return how a curve (s, 3) [m] misses a line (n, 2) [px] of a photograph.
+    Return the offsets of a curve (s, 3) [m] from a line (n, 2) [px] of a photograph.
 
     :returns: the slopes (s, 3) of the offsets, the offsets (s,) [m] across the line; and for both ends the
         slopes (2, 2, 3) and the offsets (2, 2) [m] in both directions of the picture.
@@ -200,8 +195,8 @@ def _offsets(curve: Floats, line: Floats, scale: Scale,
     moved = np.stack([scale.to_pixels(curve + step * axis) - pixels for axis in np.eye(3)], axis=2) / step
     size = np.sqrt(np.square(moved).sum(axis=(1, 2)) / 2)[:, None]  # px per metre
     nearest = tree.query(pixels)[1]
-    ahead = np.gradient(line, axis=0)[nearest]
-    across = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+    tangents = np.gradient(line, axis=0)[nearest]
+    across = np.stack([-tangents[:, 1], tangents[:, 0]], axis=1)
     across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9) * size
     slopes = np.einsum('sp,spc->sc', across, moved)
     ends = [0, -1]

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 import json
 from pathlib import Path
 import shutil
-from typing import Any, Callable, Mapping, Self, Sequence
+from typing import Any, Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -38,7 +38,7 @@ LONGEST = 100000  # characters of a calibration's options; a stranger's must not
 @dataclass(frozen=True)
 class LogHead:
     """
-    The first entry of a log: the calibration to which its evaluations belong.
+    The first entry of a log: the calibration of its evaluations.
 
     :param digest: see `calibration_digest`.
     :param namespace: of the topics; None: the session has only one.
@@ -59,7 +59,7 @@ class LogHead:
 
     @classmethod
     def read(cls, log: EvaluationLog) -> LogHead | None:
-        """Return the head of a log; None if it has none that can be used."""
+        """Return the head of a log; None if it has none, or a damaged one."""
         entry = log.find(CALIBRATION)
         if entry is None or len(entry.text) > LONGEST:
             return None
@@ -76,7 +76,7 @@ class CalibrationFolder:
     The folder of a calibration.
 
     Until the result is complete, its folder ``unfinished`` has a copy of the input and the log of the
-    evaluations, so that the calibration can go on after an interruption, even by `kill -9`. Call `begin`,
+    evaluations, so that the calibration can go on after an interruption, even by `kill -9`.  Call `begin`,
     give `log` to the calibration, then call `complete`.
 
     :ivar log: of the evaluations; None: it could not be written, so the calibration could not be resumed.
@@ -84,28 +84,29 @@ class CalibrationFolder:
     """
 
     def __init__(self, path: Path) -> None:
-        make_folder(path)  # before hours are spent on a search
-        self.path, self._kept = path, path / UNFINISHED
+        make_folder(path)  # fails before hours are spent on a search
+        self.path, self._unfinished = path, path / UNFINISHED
         self._source: Source | None = None
         try:
-            if self._kept.is_symlink():
+            if self._unfinished.is_symlink():
                 raise OSError('it is a link')
-            self._kept.mkdir(exist_ok=True)
+            self._unfinished.mkdir(exist_ok=True)
         except OSError as error:
-            raise unwritable(self._kept, error, 'folder') from error
-        self._new, self._resumed = not (self._kept / LOG).exists(), False
+            raise unwritable(self._unfinished, error, 'folder') from error
+        self._new, self._resumed = not (self._unfinished / LOG).exists(), False
         self.log: EvaluationLog | None = None
-        self._opened = EvaluationLog(self._kept / LOG)
+        self._opened_log = EvaluationLog(self._unfinished / LOG)
 
     @staticmethod
     def is_unfinished(path: Path) -> bool:
         """Tell whether a folder has a calibration that can be resumed."""
         return (path / UNFINISHED / LOG).exists()
 
-    @property
-    def input(self) -> Path:
-        """Path of the copy of the input."""
-        return input_in(self._kept)
+    @staticmethod
+    def input_of(path: Path) -> Path:
+        """Return the path of the request or session in a folder; if it is unfinished, of the copy."""
+        folder = path / UNFINISHED if CalibrationFolder.is_unfinished(path) else path
+        return folder / (REQUEST if (folder / REQUEST).exists() else SESSION)
 
     def resume(self, given: Selection) -> Selection:
         """
@@ -114,9 +115,9 @@ class CalibrationFolder:
         :param given: the selection of the command line.
         :raises InputError: if nothing here can go on, or if the command line contradicts it.
         """
-        head = LogHead.read(self._opened)
+        head = LogHead.read(self._opened_log)
         if head is None:
-            raise InputError(f'log {self._opened.path}', 'no calibration', 'a log that fit has written',
+            raise InputError(f'log {self._opened_log.path}', 'no calibration', 'a log that fit has written',
                              f'use fit SESSION --output {self.path}, with the options of the beginning')
         remedy = 'leave it out, or begin anew with fit SESSION and another --output'
         # A stranger's log must not choose a file of this machine: its user names the scene again, whose
@@ -143,26 +144,27 @@ class CalibrationFolder:
         :raises InputError: if another calibration was interrupted here, and `instead` is false.
         """
         self._source = source
-        before, head, evaluations = LogHead.read(self._opened), LogHead.of(source), self._opened.evaluations
+        before, head = LogHead.read(self._opened_log), LogHead.of(source)
+        evaluations = self._opened_log.evaluations
         if before is not None and before.digest != head.digest:
             if evaluations and not instead:
                 raise self._occupied(before, source, evaluations)
-            self._opened.remove()
-            self._opened, self._new, before = EvaluationLog(self._kept / LOG), True, None
-        if self._opened.evaluations:
-            warn(self._opened.resumed)
+            self._opened_log.remove()
+            self._opened_log, self._new, before = EvaluationLog(self._unfinished / LOG), True, None
+        if self._opened_log.evaluations:
+            warn(self._opened_log.resumed)
         if before is None:
             try:
                 if source.request is not None:
-                    _copy(source.path, self._kept / REQUEST)
+                    _copy(source.path, self._unfinished / REQUEST)
                 else:
-                    _write_session(source, self._kept / SESSION)
-                self._opened.add(CALIBRATION, Entry(np.zeros(0), json.dumps(asdict(head))))
+                    _write_session(source, self._unfinished / SESSION)
+                self._opened_log.add(CALIBRATION, Entry(np.zeros(0), json.dumps(asdict(head))))
             except (OSError, InputError) as error:
-                warn(f'warning: folder {self._kept}: cannot be written: {reason(error)}; the calibration '
-                     'could not go on after an interruption')
+                warn(f'warning: folder {self._unfinished}: cannot be written: {reason(error)}; the '
+                     'calibration could not go on after an interruption')
                 return
-        self.log = self._opened
+        self.log = self._opened_log
 
     def _occupied(self, before: LogHead, source: Source, evaluations: int) -> InputError:
         scene = before.options['scene']
@@ -175,12 +177,13 @@ class CalibrationFolder:
                           'the same trials, options and version', remedy)
 
     def complete(self, result: CalibrationResult, make_simulator: SimulatorFactory,
-                 should_stop: Callable[[], bool], *, stopped: bool) -> Attempts:
+                 should_stop: Callable[[], bool], *, stopped: bool, responsive: bool) -> Attempts:
         """
         Write the files of a result, as far as possible; once all are written, discard the log.
 
         :param make_simulator: for the slices of the report, until `should_stop` returns true.
         :param stopped: whether the user stopped the calibration; the log is then kept to resume it.
+        :param responsive: see `write_report`.
         """
         from dlo_calibration.report.page import Origin, repeating_command
         from dlo_calibration.workspace.report_writer import write_report
@@ -199,8 +202,9 @@ class CalibrationFolder:
                             source.options,
                             file_digests([*_recorded(source.path),
                                           *([self.path / copy] if copy in attempts.written else [])]),
-                            [*source.session.problems, *source.refusals])
-            write_report(self.path / REPORT, result, origin, make_simulator, should_stop)
+                            [*source.session.warnings, *source.refusals])
+            write_report(self.path / REPORT, result, origin, make_simulator, should_stop,
+                         responsive=responsive)
         if not (stopped or attempts.failure):
             self.discard()
         return attempts
@@ -208,29 +212,21 @@ class CalibrationFolder:
     def discard(self) -> None:
         """Remove the log and the copy of the input."""
         for name in (REQUEST, SESSION):
-            (self._kept / name).unlink(missing_ok=True)
-        self._opened.remove()
-        with suppress(OSError):  # somebody else's files are in it
-            self._kept.rmdir()
-
-    def __enter__(self) -> Self:
-        """Return it itself."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Close."""
-        self.close()
+            (self._unfinished / name).unlink(missing_ok=True)
+        self._opened_log.remove()
+        with suppress(OSError):  # it may have other files
+            self._unfinished.rmdir()
 
     def close(self) -> None:
         """Close the log; discard it if this calibration began it and finished no evaluation."""
-        if not self._opened.evaluations and (self._new or not self._opened.path.exists()):
+        if not self._opened_log.evaluations and (self._new or not self._opened_log.path.exists()):
             self.discard()
-        self._opened.close()
+        self._opened_log.close()
 
 
 def calibration_digest(trials: Sequence[Trial], options: Options) -> str:
     """
-    Return a digest that two calibrations share if they have the same evaluations in the same order.
+    Return a digest, the same for calibrations with the same evaluations in the same order.
 
     :raises InputError: if the scene cannot be read.
     """
@@ -253,11 +249,6 @@ def session_log(folder: Path, trials: Sequence[Trial], options: Options) -> Eval
     return EvaluationLog(folder / name)
 
 
-def input_in(folder: Path) -> Path:
-    """Return the path of the request in a folder; if there is none, of the session."""
-    return folder / (REQUEST if (folder / REQUEST).exists() else SESSION)
-
-
 def write_values(attempts: Attempts, result: CalibrationResult, options: Options) -> None:
     """Write the result and the table of its evaluations into the folder of `attempts`."""
     with attempts.attempt(RESULT):
@@ -274,17 +265,18 @@ def _recorded(path: Path) -> list[Path]:
 
 def _write_session(source: Source, path: Path) -> None:
     """
-    Write a session as one MCAP file; if it is one already, copy the file.
+    Write a session as one MCAP file; copy it if it is one already.
 
-    Of a session with remapped topics, only the inputs are written, under the names of the calibrator.
-    For a request, write the messages that a robot would have sent.
+    A session with remapped topics is written with the inputs alone, under the names of the calibrator; a
+    request becomes the messages that a robot would have sent.
     """
     files = [source.path] if source.path.is_file() else sorted(source.path.glob('*.mcap'))
     remapped = source.session.remapped
     if len(files) == 1 and files[0].suffix == '.mcap' and not remapped:
         _copy(files[0], path)
         return
-    records, options = source.session.records, source.session.recorded
+    records, given = source.session.records, source.session.file_options
+    options = None if given is None else given.values
     if remapped:
         records = source.session.renamed
     if source.request is not None:

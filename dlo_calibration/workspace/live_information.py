@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""LiveInformation: how much each new trial adds, computed in the background before a calibration."""
+"""LiveInformation: the information that each new trial adds, computed in the background."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ import numpy as np
 from dlo_calibration.calibration.choice import choose
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.calibration.prior import prior
+from dlo_calibration.calibration.prior import Prior
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.errors import one_line
 from dlo_calibration.evaluation.digest import digest
-from dlo_calibration.evaluation.evaluation import mean_length
+from dlo_calibration.evaluation.evaluation import mean_length, with_hands
 from dlo_calibration.evaluation.pool import Pool, Threads
 from dlo_calibration.inference.trial_information import (
     Appraisal,
@@ -28,19 +28,21 @@ from dlo_calibration.inference.trial_information import (
     TrialInformation,
     without_repeated_goals,
 )
+from dlo_calibration.model.parameters import HANDS
 from dlo_calibration.model.trial import Trial
+from dlo_calibration.observation.grips import GripEvidence
 from dlo_calibration.observation.material import with_shared_places
 from dlo_calibration.observation.noise import noise
 from dlo_calibration.observation.plausibility import implausible
 from dlo_calibration.workspace.worker import Background
 
-#: fingerprints -> the appraisal after these trials; or why the last one could not be appraised
-_Known = dict[tuple[tuple[str, int], ...], Union[Appraisal, str]]
+#: fingerprints -> the appraisal after these trials, or the reason why the last trial has none
+_Appraisals = dict[tuple[tuple[str, int], ...], Union[Appraisal, str]]
 
 
 class LiveInformation(Background[Optional[TrialInformation]]):
     """
-    Appraises trials in a thread of its own: it computes the information that each of them adds.
+    Computes the information that each trial adds, in a thread of its own.
 
     A trial is simulated again only after the trial, the options or the last result have changed.
 
@@ -50,17 +52,17 @@ class LiveInformation(Background[Optional[TrialInformation]]):
     def __init__(self, make_simulator: SimulatorFactory) -> None:
         super().__init__('appraisal')
         self._make_simulator = make_simulator
-        # `_known` is valid for these options and this result
+        # `_appraisals` is valid for these options and this result
         self._base: tuple[Options, CalibrationResult | None] | None = None
-        self._known: _Known = {}
+        self._appraisals: _Appraisals = {}
 
     def start(self, trials: Sequence[Trial], options: Options, result: CalibrationResult | None = None,
               whole: bool = True) -> None:
         """
         Begin to appraise the trials that are new, and return immediately.
 
-        :param result: of the last calibration, whose trials are not appraised again; it is ignored if it has
-            other parameters.
+        :param result: of the last calibration, whose trials are not appraised again; ignored if it has other
+            parameters.
         :param whole: whether the last trial is complete; if not, it is left out unless it ends at rest.
         :raises DloCalibrationError: while another appraisal is under way.
         """
@@ -70,12 +72,12 @@ class LiveInformation(Background[Optional[TrialInformation]]):
         if result is not None and result.space != options.space:
             result = None
         if self._base is None or self._base[0] != options or self._base[1] is not result:
-            self._base, self._known = (options, result), {}
-        known, put = self._known, self.events.put
+            self._base, self._appraisals = (options, result), {}
+        appraisals, put = self._appraisals, self.events.put
 
         def work(should_stop: Callable[[], bool]) -> None:
             try:
-                self._appraise(tuple(trials), options, result, known, put, should_stop)
+                self._appraise(tuple(trials), options, result, appraisals, put, should_stop)
             except CancelledError:
                 pass
             except Exception as error:  # an appraisal never disturbs the node
@@ -93,45 +95,51 @@ class LiveInformation(Background[Optional[TrialInformation]]):
         return (event for event in self.waiting_events() if isinstance(event, TrialInformation))
 
     def _appraise(self, trials: Sequence[Trial], options: Options, result: CalibrationResult | None,
-                  informations: _Known, put: Callable[[TrialInformation], None],
+                  appraisals: _Appraisals, put: Callable[[TrialInformation], None],
                   should_stop: Callable[[], bool]) -> None:
         space, height = options.space, options.table_top
         examination = None if result is None else result.examination
         done = fingerprints(result.trials) if result and examination and examination.regular else []
         keys = fingerprints(trials)
         new = [(k, tuple(keys[:k + 1])) for k, key in enumerate(keys) if key not in done]
-        if all(key in informations for _, key in new):
+        if all(key in appraisals for _, key in new):
             return
-        trials = with_shared_places(trials)
-        start, default = prior(trials, options).hints.start, space.default_point()
+        evidence = GripEvidence.of(trials)
+        lost = {loss.trial: str(loss) for loss in evidence.losses}
+        usable = {trial.name: trial for trial in evidence.usable(trials)}
+        hands = {name: getattr(options, name) for name in HANDS}
+        trials = with_shared_places([with_hands(usable.get(trial.name, trial), hands) for trial in trials])
+        start, default = Prior.of(trials, options, evidence).hints.start, space.default_point()
         guessed = tuple(name for name, value in zip(space.free, start, strict=True) if np.isnan(value))
-        known, appraised = Appraisal.before(space.free, np.where(np.isnan(start), default, start)), []
+        before, appraised = Appraisal.before(space.free, np.where(np.isnan(start), default, start)), []
         if result is not None and done and examination is not None:
-            known = Appraisal(known.names, result.best.point, examination.uncertainty)
+            before = Appraisal(before.names, result.best.point, examination.uncertainty)
             appraised = list(result.trials)
         with closing(self._make_simulator(options)) as simulator, closing(Threads(1)) as thread:
             pool = Pool(simulator, thread, should_stop)
             for k, key in new:
-                trial, fresh = trials[k], key not in informations
-                reasons = implausible(trial, height, bool(options.scene)) if fresh else ()
+                trial, fresh = trials[k], key not in appraisals
+                reasons = () if not fresh else (lost[trial.name],) if trial.name not in usable else \
+                    implausible(trial, height, bool(options.scene))
                 if reasons:  # information from it would be wrong
-                    informations[key] = reasons[0]
+                    appraisals[key] = reasons[0]
                 elif fresh:
                     try:
-                        informations[key] = Appraiser(
+                        appraisals[key] = Appraiser(
                             space, pool, mean_length(trials), height, noise(trials), guessed).after(
-                            known, [*appraised, trial])
+                            before, [*appraised, trial])
                     except CancelledError:
                         raise
                     except Exception as error:  # of the engine
-                        informations[key] = one_line(error)
-                appraisal = informations[key]
+                        appraisals[key] = one_line(error)
+                appraisal = appraisals[key]
                 if isinstance(appraisal, str):
-                    added = TrialInformation.unknown(trial.name, known.names, appraisal)
+                    added = TrialInformation.unknown(trial.name, before.names, appraisal)
                 else:
-                    added = TrialInformation(trial.name, known.names, known.uncertainty.std,
-                                             appraisal.uncertainty.std, appraisal.uncertainty.verdicts)
-                    known, appraised = appraisal, [*appraised, trial]
+                    added = TrialInformation(trial.name, before.names, before.uncertainty.std,
+                                             appraisal.uncertainty.std, appraisal.uncertainty.verdicts,
+                                             outlier=appraisal.outlier([*appraised, trial]))
+                    before, appraised = appraisal, [*appraised, trial]
                 if fresh:
                     put(added)
 

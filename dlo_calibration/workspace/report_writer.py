@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The page of a result: pictures are drawn in a process of their own; on the node, in the background, too."""
+"""The page of a result; on the node, it is written in the background."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ PATIENCE = 10.0  # s; whoever ends the node does not wait longer
 
 
 def write_report(path: Path, result: CalibrationResult, origin: Origin, make_simulator: SimulatorFactory,
-                 should_stop: Callable[[], bool], niceness: int = 0) -> None:
+                 should_stop: Callable[[], bool], *, responsive: bool) -> None:
     """
     Write the page of a result, with slices that are simulated here.
 
-    Its pictures are drawn in another process: while Matplotlib draws in a thread, a service of the node or
-    the capture page may wait for more than 0.1 s.
-
     :param should_stop: once it returns true, the page gets no more slices.
-    :param niceness: how far drawing gives way to other processes, as `os.nice`.
+    :param responsive: whether to draw the pictures in another process.  While Matplotlib draws in a thread, a
+        service of the node or the capture page may wait for more than 0.1 s; a process costs memory.
     :raises DloCalibrationError: if the page cannot be drawn or written.
     """
+    executor = (ProcessPoolExecutor(1, get_context('spawn'), _give_way_and_end_with_parent) if responsive
+                else ThreadPoolExecutor(1))
     try:
-        with ProcessPoolExecutor(1, get_context('spawn'), _end_with_parent, (niceness,)) as process:
-            process.submit(import_module, 'matplotlib.figure')  # loading it takes as long as the slices
+        with executor:
+            executor.submit(import_module, 'matplotlib.figure')  # loading it takes as long as the slices
             slices = sliced(result, origin.options, make_simulator, should_stop)
-            page = process.submit(page_of, result, origin, slices).result()
+            page = executor.submit(page_of, result, origin, slices).result()
     except BrokenExecutor as error:
         raise DloCalibrationError('the process that draws it was ended from outside') from error
     write_file(path, page)
@@ -89,13 +89,13 @@ class ReportWriter:
     def _write(self, path: Path, result: CalibrationResult, origin: Origin, older: Path | None) -> None:
         if older is not None and path.exists():
             path.replace(older)
-        write_report(path, result, origin, self._make_simulator, self._stop.is_set, 5)
+        write_report(path, result, origin, self._make_simulator, self._stop.is_set, responsive=True)
 
 
-def _end_with_parent(niceness: int) -> None:
-    """Leave signals to the parent, and end with it, even if it is killed."""
+def _give_way_and_end_with_parent() -> None:
+    """Give way to other processes; leave signals to the parent, and end with it, even if it is killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.nice(niceness)
+    os.nice(5)
     threading.Thread(target=_wait_for_its_end, daemon=True).start()
 
 

@@ -9,19 +9,21 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Callable, Mapping, Sequence
 
+from dlo_calibration.calibration.choice import hand_warnings
 from dlo_calibration.calibration.options import FileOptions, names_of, OBSERVATION, Options
 from dlo_calibration.errors import DloCalibrationError, InputError
 from dlo_calibration.files.request import read_request, Request, request_manipulations, request_trials
 from dlo_calibration.files.session import read_session, Session, session_manipulations, session_trials
 from dlo_calibration.model.named_actions import Manipulation
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.observation.plausibility import implausible_trials
+from dlo_calibration.observation.grips import GripEvidence
+from dlo_calibration.observation.plausibility import implausible_trials, repeated_trials
 
 
 @dataclass(frozen=True)
 class Selection:
     """
-    A session or a request, and what to use of it.
+    A session or a request, and the selected parts of it.
 
     :param options: given by the user, by name; they override the recorded ones.
     :param namespace: of the topics; None: the session has only one.
@@ -42,11 +44,13 @@ class Source:
     A session or a request, the options to use on it, and its trials.
 
     :param session: as recorded; for a request, a session without messages.
-    :param warnings: about what was read, one text each.
-    :param refusal: why the scene of the file is not used; nothing is simulated without it.
+    :param warnings: about the file, one text each.
+    :param refusal: why the scene of the file is not used; without it nothing is simulated.
     :param refusals: one text for each message that is not used, with the reason.
+    :param notes: about messages that are unused as they should be.
     :param numbers: of the trials, from 1; trials that the user leaves out count, too.
     :param implausible: why the trials cannot be as described, see `plausibility`.
+    :param evidence: of the hands in the trials.
     """
 
     selection: Selection
@@ -57,8 +61,16 @@ class Source:
     refusal: InputError | None
     trials: tuple[Trial, ...] = ()
     refusals: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     numbers: tuple[int, ...] = ()
     implausible: tuple[str, ...] = ()
+    evidence: GripEvidence = GripEvidence(None, None, ())
+
+    @property
+    def trial_warnings(self) -> tuple[str, ...]:
+        """Warnings about the trials: implausible and repeated ones, and errors of hands."""
+        return (*self.implausible, *repeated_trials(self.trials), *map(str, self.evidence.losses),
+                *hand_warnings(self.evidence, self.options))
 
     @property
     def path(self) -> Path:
@@ -106,33 +118,36 @@ def read_source(selection: Selection, warn: Callable[[str], None], of_result: Fi
 
     :param warn: called with each sentence that the user should read.
     :param of_result: options of a result; they override the recorded ones, except for the observation.
-    :param any_topics: a session without any topic of the calibrator is read, too.
-    :raises InputError: if it cannot be read, an option has a bad value, or a trial to leave out is not there.
+    :param any_topics: read a session without any topic of the calibrator, too.
+    :raises InputError: if it cannot be read, an option has a bad value, or a trial to leave out is missing.
     """
-    source = _opened(selection, warn, of_result, any_topics)
+    source = _read(selection, warn, of_result, any_topics)
     options = source.options
-    trials, refusals = session_trials(source.session, options) if source.request is None else \
+    notes: list[str] = []
+    trials, refusals = session_trials(source.session, options, notes.append) if source.request is None else \
         request_trials(source.request, options)
-    for text in (*source.warnings, *(refusals if trials or source.request is None else ())):
+    for text in (*source.warnings, *notes, *(refusals if trials or source.request is None else ())):
         warn(text)  # if no trial of a request can be used, `require_trials` says why
     numbers = _numbers(selection.without, [trial.name for trial in trials], warn)
     used = tuple(trials[number - 1] for number in numbers)
     implausible = implausible_trials(used, options.table_top, bool(options.scene))
-    for text in implausible:
+    source = replace(source, trials=used, refusals=refusals, notes=tuple(notes), numbers=numbers,
+                     implausible=implausible, evidence=GripEvidence.of(used))
+    for text in source.trial_warnings:
         warn(text)
-    return replace(source, trials=used, refusals=refusals, numbers=numbers, implausible=implausible)
+    return source
 
 
 def read_manipulations(selection: Selection, warn: Callable[[str], None], of_result: FileOptions
                        ) -> tuple[tuple[Manipulation, ...], Options]:
     """
-    Read what the hands do in a session or a request, with or without goal chains, and the options to use.
+    Read the manipulations of a session or a request, with or without goal chains, and the options to use.
 
     The parameters are those of `read_source`.
 
     :raises InputError: if it cannot be read, has no action, or an option has a bad value.
     """
-    source = _opened(selection, warn, of_result)
+    source = _read(selection, warn, of_result)
     if source.refusal is not None:
         raise source.refusal
     manipulations, refusals = session_manipulations(source.session, source.options) \
@@ -147,7 +162,7 @@ def read_manipulations(selection: Selection, warn: Callable[[str], None], of_res
     return tuple(manipulations[number - 1] for number in numbers), source.options
 
 
-def _opened(selection: Selection, warn: Callable[[str], None], of_result: FileOptions | None,
+def _read(selection: Selection, warn: Callable[[str], None], of_result: FileOptions | None,
             any_topics: bool = False) -> Source:
     """Read a session or a request, without its trials; see `read_source`."""
     path = selection.path
@@ -156,13 +171,14 @@ def _opened(selection: Selection, warn: Callable[[str], None], of_result: FileOp
         raise InputError('--remap', 'a request, which has no topics', 'a recorded session', 'leave it out')
     session = read_session(path, selection.namespace, selection.remap, any_topics=any_topics) \
         if request is None else \
-        Session(path, (), (), dict(request.options), request.problems, request.refusal)
-    recorded, warnings, refusal = session.recorded or {}, session.problems, session.refusal
+        Session(path, (), (), request.file_options, request.file_options.warnings)
+    given = session.file_options or FileOptions()
+    recorded, warnings, refusal = given.values, session.warnings, given.refusal
     if of_result:
         observed = {name: value for name, value in recorded.items() if name in names_of(OBSERVATION)}
         if 'scene' not in observed:
             refusal = refusal or of_result.refusal
-        recorded, warnings = {**of_result.values, **observed}, (*of_result.problems, *warnings)
+        recorded, warnings = {**of_result.values, **observed}, (*of_result.warnings, *warnings)
     options = Options.of({**recorded, **selection.options})
     for name in selection.options:
         value = options.flat()[name]
@@ -189,5 +205,5 @@ def _numbers(without: Sequence[int], names: Sequence[str], warn: Callable[[str],
 
 
 def _text(value: Any) -> str:
-    """Return the value of an option as a user types it."""
+    """Return the value of an option as typed by a user."""
     return ' '.join(value) if isinstance(value, list) else str(value)

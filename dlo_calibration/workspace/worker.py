@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Worker: calibrates in a thread of its own, which puts frozen events on a queue; and the progress."""
+"""Worker: calibrates in a thread of its own, which puts frozen events on a queue; and its progress."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ class Failure:
 
 
 @dataclass(frozen=True)
-class Notice:
+class CalibrationWarning:
     """
-    Something that the user should know immediately, and that does not end the work.
+    A warning of a calibration under way, to be shown immediately.
 
     :param text: one line, e.g. about a process that died.
     """
@@ -56,7 +56,7 @@ class Background(Generic[Event]):
     """
     Does one piece of work at a time in a thread of its own.
 
-    `events` receives what the work puts there, in order, and at the end exactly one event: what the work
+    `events` receives the events of the work, in order, and at the end exactly one: the value that the work
     returns, or a `Failure`.
 
     :param name: of the work, e.g. ``calibration``.
@@ -82,7 +82,7 @@ class Background(Generic[Event]):
         """
         Begin to work.
 
-        :param work: gets a function that tells whether to end with the best so far.
+        :param work: called with a function that tells whether to end with the best so far.
         :raises DloCalibrationError: while it is working already.
         """
         if self.alive:
@@ -98,7 +98,7 @@ class Background(Generic[Event]):
 
     def waiting_events(self) -> Iterator[Event | Failure]:
         """Yield the waiting `events`, without waiting for more."""
-        while not self.events.empty():  # nobody else takes any
+        while not self.events.empty():  # there is no other reader
             yield self.events.get_nowait()
 
     def join(self, timeout: float | None = None) -> bool:
@@ -115,20 +115,20 @@ class Background(Generic[Event]):
             event = work(should_stop)
         except DloCalibrationError as error:
             event = Failure(str(error))
-        except BaseException as error:  # the user would wait for ever for a thread that died silently
+        except BaseException as error:  # else the user waits for ever for a dead thread
             event = Failure(one_line(error), traceback.format_exc())
         events.put(event)
 
 
-CalibrationEvent = Evaluation | Notice | CalibrationResult | Failure
+CalibrationEvent = Evaluation | CalibrationWarning | CalibrationResult | Failure
 
 
 class Worker(Background[CalibrationEvent]):
     """
     Calibrates in a thread of its own.
 
-    `events` receives each finished `Evaluation`, in order, a `Notice` for anything else that the user
-    should know, and at the end exactly one `CalibrationResult` or `Failure`.
+    `events` receives each finished `Evaluation`, in order, each `CalibrationWarning`, and at the end exactly
+    one `CalibrationResult` or `Failure`.
 
     :param make_simulator: makes the engine; called in the thread that uses the engine.
     """
@@ -147,11 +147,13 @@ class Worker(Background[CalibrationEvent]):
         trials = tuple(trials)
 
         def work(should_stop: Callable[[], bool]) -> CalibrationEvent:
+            def warn(text: str) -> None:
+                self.events.put(CalibrationWarning(text))
+
             if log is not None and log.resumed:
-                self.events.put(Notice(log.resumed))
-            return calibrate(trials, options, on_evaluation=self.events.put,
-                             on_notice=lambda text: self.events.put(Notice(text)), should_stop=should_stop,
-                             make_simulator=self._make_simulator, log=log)
+                warn(log.resumed)
+            return calibrate(trials, options, on_evaluation=self.events.put, on_notice=warn,
+                             should_stop=should_stop, make_simulator=self._make_simulator, log=log)
 
         self.begin(work)
 
@@ -162,14 +164,14 @@ class Progress:
 
     :param evaluations: largest number of evaluations.
     :param trials: number of trials that each evaluation simulates.
-    :param known: number of evaluations that a log answers; they do not count for the speed.
+    :param logged: number of evaluations that a log answers; they do not count for the speed.
     :param clock: the time [s].
     """
 
-    def __init__(self, evaluations: int, trials: int, known: int = 0,
+    def __init__(self, evaluations: int, trials: int, logged: int = 0,
                  clock: Callable[[], float] = time.monotonic) -> None:
         self.evaluations = evaluations
-        self._known = known
+        self._logged = logged
         self.count = 0
         self.newest: Evaluation | None = None
         self.best: Evaluation | None = None
@@ -181,7 +183,7 @@ class Progress:
     def take(self, evaluation: Evaluation) -> None:
         """Count the next evaluation."""
         self.count += 1
-        if self.count > self._known:
+        if self.count > self._logged:
             self._simulations += self._trials - evaluation.skipped
         else:
             self._begun = self._clock()
@@ -214,8 +216,8 @@ class Progress:
     @property
     def seconds_left(self) -> float:
         """Time until the last evaluation [s], at the speed so far; infinite before the first one."""
-        left, made = self.evaluations - self.count, self.count - self._known
-        return self._elapsed / made * left if made > 0 else float('inf')
+        remaining, simulated = self.evaluations - self.count, self.count - self._logged
+        return self._elapsed / simulated * remaining if simulated > 0 else float('inf')
 
     @property
     def _elapsed(self) -> float:

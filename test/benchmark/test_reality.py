@@ -13,8 +13,8 @@ from reality import (
     laid,
     random_pair,
     Reality,
+    relative_distance,
     seen,
-    share_apart,
 )
 
 from dlo_calibration import Action, Chain, Hand
@@ -38,7 +38,7 @@ def pairs(simulator):
 @pytest.mark.parametrize('dlo', [ROPE, HOSE])
 def test_start_and_goal_are_shapes_at_rest_that_lie_apart(dlo, pairs, simulator):
     for pair in pairs[dlo]:
-        assert 0.15 <= share_apart(dlo, pair.start.points, pair.goal.points) <= 0.3001
+        assert 0.15 <= relative_distance(dlo, pair.start.points, pair.goal.points) <= 0.3001
         for chain in (pair.start, pair.goal):
             assert np.abs(laid(dlo, chain.points, simulator) - chain.points).max() < 1e-3
             assert chain.length == pytest.approx(dlo.length, rel=0.01)

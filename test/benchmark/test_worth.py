@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What calibration is worth: how plans are executed, what is kept of them, and what the tables say."""
+"""What calibration is worth: the execution of plans, their journals, and the tables."""
 
 from concurrent.futures import CancelledError
 import csv
@@ -30,6 +30,7 @@ from worth_tables import ALL, executions_csv, markdown, picture, table_rows
 
 from dlo_calibration import Action, Hand, InputError, read_session
 from dlo_calibration.calibration.engines import make_simulator as make_real_simulator
+from dlo_calibration.experiment.journal import Laboratory
 from dlo_calibration.experiment.study import Observed
 from dlo_calibration.files.session import samples
 from dlo_calibration.model.parameters import BY_NAME
@@ -47,14 +48,14 @@ def coarse(options):
 
 
 class Nudging:
-    """A planner whose every plan drags the middle by 1 cm, so many times; it keeps what it was asked."""
+    """A planner whose plans drag the middle by 1 cm, `actions` times; it records its arguments."""
 
     def __init__(self, actions=2):
         self.actions = actions
         self.starts, self.goals, self.most = [], [], []
 
-    def __call__(self, found, start, goal, options, *, simulation, should_stop):
-        assert found.length == pytest.approx(ROPE.length, rel=0.01)
+    def __call__(self, dlo, start, goal, options, *, simulation, should_stop):
+        assert dlo.length == pytest.approx(ROPE.length, rel=0.01)
         assert simulation.mass == ROPE.mass
         self.starts.append(start.points)
         self.goals.append(goal.points)
@@ -119,32 +120,34 @@ def test_a_belief_is_that_of_a_calibrated_dlo():
     assert default['mass'] == ROPE.mass
     session = read_session(samples() / ROPE.name)
     observed = Observed(session.trials[:2], replace(session.options, evaluations=20))
-    found = learn(CalibrationTask(ROPE, observed, 'compiled'), coarse)
-    assert found.kind == FITTED
-    assert found.intervals['friction'][0] == pytest.approx(ROPE.values['friction'], abs=15)
-    assert Belief.of(json.loads(json.dumps(asdict(found)))) == found
+    belief = learn(CalibrationTask(ROPE, observed, 'compiled'), coarse)
+    assert belief.kind == FITTED
+    assert belief.intervals['friction'][0] == pytest.approx(ROPE.values['friction'], abs=15)
+    assert Belief.of(json.loads(json.dumps(asdict(belief)))) == belief
 
 
 def study(**changed):
     session = read_session(samples() / ROPE.name)
     observed = Observed(session.trials[:1], replace(session.options, evaluations=5))
-    return replace(WorthStudy({ROPE: observed}, 1, 1, PlanOptions(workers=1), 1, 'the command'), **changed)
+    return replace(WorthStudy({ROPE: observed}, 1, 1, PlanOptions(workers=1), 'the command'), **changed)
 
 
 def test_an_interrupted_experiment_continues_and_repeats_nothing(tmp_path):
-    told, planner = [], Nudging(1)
-    text, _ = conduct_worth(study(), tmp_path, coarse, lambda: len(planner.starts) > 8, told.append,
-                            io.StringIO(), planner)
+    reports, planner = [], Nudging(1)
+
+    def laboratory(stop=lambda: False):
+        return Laboratory(tmp_path, 1, stop, reports.append, io.StringIO())
+
+    text = conduct_worth(study(), laboratory(lambda: len(planner.starts) > 8), coarse, planner)
     assert '**Not complete**' in text
-    assert '1 of 3 are done' in told[-1]
+    assert '1 of 3 are done' in reports[-1]
     before = len(planner.starts)
-    rest = tmp_path, coarse, lambda: False, told.append, io.StringIO(), planner
-    text, attempts = conduct_worth(study(), *rest)
+    second = laboratory()
+    text = conduct_worth(study(), second, coarse, planner)
     assert '**Not complete**' not in text
     assert len(planner.starts) - before == 2 * 6
-    assert attempts.written == ['worth.md', 'worth.csv', 'worth.png']
-    again, _ = conduct_worth(study(), *rest)
-    assert again == text
+    assert second.attempts.written == ['worth.md', 'worth.csv', 'worth.png']
+    assert conduct_worth(study(), laboratory(), coarse, planner) == text
     assert len(planner.starts) - before == 2 * 6
     assert (tmp_path / 'worth.md').read_text() == text
 
@@ -155,8 +158,8 @@ def test_no_pairs_are_refused():
 
 
 def outcome(error, way_error, score=10.0, missed=0):
-    one = Execution((20.0, error), (99.0, score), missed, 0.5, 1, 100, 2.0)
-    return PlanOutcome(one, replace(one, errors=(20.0, 5.0, way_error), missed=0))
+    execution = Execution((20.0, error), (99.0, score), missed, 0.5, 1, 100, 2.0)
+    return PlanOutcome(execution, replace(execution, errors=(20.0, 5.0, way_error), missed=0))
 
 
 def made_up():
@@ -171,18 +174,18 @@ def made_up():
 
 
 def test_the_tables_compare_the_kinds_of_parameters():
-    found = {(one.subject, one.kind): one for one in table_rows(made_up(), 'open_loop')}
-    assert list(found) == [('object1', FITTED), ('object1', DEFAULT), ('object1', TRUE),
+    rows = {(row.subject, row.kind): row for row in table_rows(made_up(), 'open_loop')}
+    assert list(rows) == [('object1', FITTED), ('object1', DEFAULT), ('object1', TRUE),
                            ('object2', DEFAULT), (ALL, FITTED), (ALL, DEFAULT), (ALL, TRUE)]
-    fitted = found['object1', FITTED]
+    fitted = rows['object1', FITTED]
     assert (fitted.pairs, fitted.median, fitted.worst) == pytest.approx((3, 2.4, 3.6))
     assert fitted.most == pytest.approx(np.percentile([1.2, 2.4, 3.6], 90))
     assert (fitted.near, fitted.similar, fitted.missed) == (pytest.approx(2 / 3), 1.0, 3)
     assert fitted.ratio == pytest.approx(1.2)
-    assert found['object2', DEFAULT].ratio is None
-    assert found[ALL, DEFAULT].worst == 15.0
-    assert found[ALL, DEFAULT].similar == 0.75
-    replanned = {(one.subject, one.kind): one for one in table_rows(made_up(), 'replanned')}
+    assert rows['object2', DEFAULT].ratio is None
+    assert rows[ALL, DEFAULT].worst == 15.0
+    assert rows[ALL, DEFAULT].similar == 0.75
+    replanned = {(row.subject, row.kind): row for row in table_rows(made_up(), 'replanned')}
     assert (replanned['object1', TRUE].median, replanned['object1', TRUE].actions) == (1.0, 2.0)
     text = markdown(made_up(), 'the command', 'compiled', complete=False)
     assert '| object1 | fitted | 20 | **2.4** |' in text
@@ -199,6 +202,6 @@ def test_every_execution_is_a_row_and_the_picture_is_drawn(tmp_path):
 
 
 def test_journals_keep_every_digit():
-    for _, one in made_up():
-        assert PlanOutcome.of(json.loads(json.dumps(asdict(one)))) == one
+    for _, executions in made_up():
+        assert PlanOutcome.of(json.loads(json.dumps(asdict(executions)))) == executions
     assert TASK.key != replace(TASK, index=1).key != replace(TASK, options=PlanOptions(draws=1)).key

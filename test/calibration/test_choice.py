@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What is calibrated where the user leaves it open."""
+"""The options that the trials decide where the user leaves them open."""
 
 from contextlib import closing
 from dataclasses import replace
@@ -28,7 +28,7 @@ TRUTH = {'flexibility': 45.0, 'damping': 60.0, 'internal_damping': 40.0, 'torsio
 
 
 def stream():
-    """Return a trial in which two clamps come together, turn and rise, and what was seen meanwhile."""
+    """Return a trial in which two clamps come together, turn and rise, with goals in motion."""
     points = np.stack([np.linspace(0, 0.6, 13), np.zeros(13), np.ones(13)], axis=1)
     times, half = np.linspace(0, 1.2, 7), np.linspace(0, 1.2, 7) / 2
     turn = np.stack([np.sin(half), 0 * half, 0 * half, np.cos(half)], axis=1)  # about the DLO
@@ -39,9 +39,9 @@ def stream():
 
 
 def in_motion():
-    """Return a trial of the toy that was seen while the hand moved."""
+    """Return a trial of the toy with a goal in motion."""
     trial, = toy_trials(1)
-    return replace(trial, goals=(replace(trial.goals[0], time=1.0, stable=False),))
+    return replace(trial, goals=(replace(trial.goals[0], time=trial.hands[0].end, stable=False),))
 
 
 def test_trials_at_rest_give_the_papers_four_and_the_same_result():
@@ -51,29 +51,30 @@ def test_trials_at_rest_give_the_papers_four_and_the_same_result():
         PAPER_PARAMETERS, PAPER_ROUNDS + REFINEMENT)
     assert choice.words == ('Calibrated: flexibility, elasticity, friction, self_collision; '
                             'not damping, internal_damping, because no goal was seen in motion.')
-    auto, named = (calibrate(trials, replace(one, evaluations=20), make_simulator=new_toy)
-                   for one in (options, choice.options))
-    assert [one.score for one in auto.evaluations] == [one.score for one in named.evaluations]
+    auto, named = (calibrate(trials, replace(each, evaluations=20), make_simulator=new_toy)
+                   for each in (options, choice.options))
+    assert [evaluation.score for evaluation in auto.evaluations] == [
+        evaluation.score for evaluation in named.evaluations]
     assert auto.parameters == named.parameters
     assert named.choice.words == ''
 
 
 def test_motion_adds_parameters_and_the_result_says_why(tmp_path, capsys):
     trials, options = [*toy_trials(1), in_motion()], Options(workers=1, evaluations=20)
-    found = calibrate(trials, options, make_simulator=new_toy)
-    assert tuple(found.parameters) == (*PAPER_PARAMETERS, *IN_MOTION)
-    assert 'damping, internal_damping, because goals were seen in motion' in found.choice.words
-    print_result(found, sys.stdout)
-    assert found.choice.words in ' '.join(capsys.readouterr().out.split())
-    write_result(tmp_path / 'result.xml', found, options.flat())
+    result = calibrate(trials, options, make_simulator=new_toy)
+    assert tuple(result.parameters) == (*PAPER_PARAMETERS, *IN_MOTION)
+    assert 'damping, internal_damping, because goals were seen in motion' in result.choice.words
+    print_result(result, sys.stdout)
+    assert result.choice.words in ' '.join(capsys.readouterr().out.split())
+    write_result(tmp_path / 'result.xml', result, options.flat())
     file = read_result(tmp_path / 'result.xml')
-    assert file.choice == found.choice.words
-    assert file.options['calibrate'] == [*PAPER_PARAMETERS, *IN_MOTION]
+    assert file.choice == result.choice.words
+    assert file.file_options.values['calibrate'] == [*PAPER_PARAMETERS, *IN_MOTION]
     again = calibrate(trials, replace(file.file_options.options(), workers=1), make_simulator=new_toy)
-    assert again.parameters == found.parameters
+    assert again.parameters == result.parameters
 
 
-def test_a_motion_between_two_clamps_adds_what_acts_there():
+def test_a_motion_between_two_clamps_adds_torsion_and_friction_between_strands():
     choice = choose([stream()], Options())
     assert choice.options.calibrate == ALL
     assert f'{", ".join(BETWEEN_CLAMPS)}, because a motion between two clamps was seen' in choice.words
@@ -105,8 +106,8 @@ def test_trials_are_appraised_with_the_parameters_that_they_show():
     live = LiveInformation(new_toy)
     live.start([in_motion()], Options(workers=1))
     assert live.join(60)
-    one, = live.waiting_information()
-    assert one.names == (*PAPER_PARAMETERS, *IN_MOTION)
+    information, = live.waiting_information()
+    assert information.names == (*PAPER_PARAMETERS, *IN_MOTION)
 
 
 def test_an_experiment_finds_the_same_parameters_whichever_trial_is_left_out():
@@ -116,17 +117,17 @@ def test_an_experiment_finds_the_same_parameters_whichever_trial_is_left_out():
 
 def test_a_stream_between_clamps_gives_its_parameters_back():
     draft = stream()
-    known = {name: 25.0 if name == 'elasticity' else 50.0 for name in PAPER_PARAMETERS}
+    others = {name: 25.0 if name == 'elasticity' else 50.0 for name in PAPER_PARAMETERS}
     options = replace(QUICK, calibrate=ALL)
     with closing(make_simulator(options)) as simulator:
-        physical = options.space.physical({**known, **TRUTH}, draft.initial.length)
+        physical = options.space.physical({**others, **TRUTH}, draft.initial.length)
         seen = simulator.simulate(draft, physical).chains
     noise = np.random.default_rng(1).normal(0, 1e-4, seen.shape)
     trial = replace(draft, goals=tuple(
         replace(goal, chain=Chain(points)) for goal, points in zip(draft.goals, seen + noise, strict=True)))
-    found = calibrate([trial], QUICK)
-    assert tuple(found.parameters) == ALL
+    result = calibrate([trial], QUICK)
+    assert tuple(result.parameters) == ALL
     for name, value in TRUTH.items():
-        one = found.parameters[name]
-        assert one.value == pytest.approx(value, abs=5), name
-        assert one.lower < value < one.upper, name
+        estimate = result.parameters[name]
+        assert estimate.value == pytest.approx(value, abs=5), name
+        assert estimate.lower < value < estimate.upper, name

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The choice of an engine: what each name gives, what it refuses, and what is told."""
+"""The choice of an engine: what each name gives, what it refuses, and its warnings."""
 
 import logging
 import pickle
@@ -23,8 +23,8 @@ BOX = ('<robot name="box"><link name="box"><collision><geometry><box size="0.1 0
 
 
 @pytest.fixture
-def notices(caplog):
-    """Give a function that returns what was told since this process began, which is now."""
+def warnings(caplog):
+    """Give a function that returns the warnings so far, as of a new process."""
     engines._warn_once.cache_clear()
     caplog.set_level(logging.WARNING, 'dlo_calibration')
     return lambda: [record.getMessage() for record in caplog.records]
@@ -38,23 +38,23 @@ def scene(tmp_path):
 
 
 def test_every_engine_that_can_be_chosen_can_be_made():
-    engine, = (one for one in Options.declarations() if one.name == 'engine')
+    engine, = (declaration for declaration in Options.declarations() if declaration.name == 'engine')
     assert set(ENGINES) == set(engine.choices)
     assert Options().engine == 'auto'
 
 
-def test_auto_is_the_compiled_engine_without_a_warning(notices):
+def test_auto_is_the_compiled_engine_without_a_warning(warnings):
     for engine in ('auto', 'compiled'):
         assert make_simulator(Options(engine=engine)).name == 'compiled'
-    assert notices() == []
+    assert warnings() == []
 
 
 @pytest.mark.pybullet
-def test_bullet_is_one_option_away(notices):
+def test_the_option_engine_chooses_bullet(warnings):
     simulator = make_simulator(Options(engine='bullet'))
     assert type(simulator) is ProcessSimulator
     assert simulator.name == 'bullet'
-    assert notices() == []
+    assert warnings() == []
 
 
 @pytest.mark.parametrize('finer', [False, True])
@@ -76,10 +76,10 @@ def test_the_compiled_engine_refuses_a_scene_by_name(scene):
 
 
 @pytest.mark.pybullet
-def test_auto_simulates_a_scene_with_bullet_and_says_so_once(scene, notices):
+def test_auto_simulates_a_scene_with_bullet_and_says_so_once(scene, warnings):
     for _ in range(2):
         assert make_simulator(Options(scene=scene)).name == 'bullet'
-    assert notices() == [f'PyBullet simulates the evaluations, about 60 times slower, because engine '
+    assert warnings() == [f'PyBullet simulates the evaluations, about 60 times slower, because engine '
                          f'compiled does not support a scene: {scene}']
 
 
@@ -99,7 +99,7 @@ def test_a_path_is_relative_to_the_working_directory(scene, tmp_path, monkeypatc
 
 @pytest.fixture
 def without_pybullet(monkeypatch):
-    """Let PyBullet be one of the libraries that are not installed."""
+    """Hide PyBullet, as if it were not installed."""
     monkeypatch.setitem(sys.modules, 'pybullet', None)
 
 

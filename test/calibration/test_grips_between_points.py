@@ -44,8 +44,8 @@ def test_the_simulated_dlo_is_nearer_to_the_truth_than_with_the_nearest_point():
         errors = []
         for offset in (0.0, BESIDE / STEP):
             trial = seen(whole, goal, offset)
-            found, = simulator.simulate(trial, physical).chains
-            errors.append(np.linalg.norm(found - trial.goals[0].chain.points, axis=1).mean())
+            simulated, = simulator.simulate(trial, physical).chains
+            errors.append(np.linalg.norm(simulated - trial.goals[0].chain.points, axis=1).mean())
     assert errors[1] < 0.5 * errors[0]
 
 

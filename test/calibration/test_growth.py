@@ -20,7 +20,7 @@ TRUTH = dict(zip(PAPER_PARAMETERS, (30.0, 60.0, 45.0, 20.0), strict=True))
 
 
 def dragged(points, goals):
-    """Return a trial: a DLO that a hand drags by one end, seen at so many instants."""
+    """Return a trial: a hand drags a DLO by one end, with a number of goals."""
     x = np.linspace(0, 0.6, points)
     chain = Chain(np.stack([x, np.zeros(points), np.full(points, 0.004)], axis=1))
     hand = Hand('hand', (points - 1,), [0.0, 3.0], chain.points[-1] + [[0, 0, 0], [-0.1, 0.1, 0]])
@@ -29,7 +29,7 @@ def dragged(points, goals):
 
 
 def calls_of(work):
-    """Return how many functions something calls."""
+    """Return the number of function calls of some work."""
     calls = 0
 
     def count(frame, event, argument):
@@ -46,23 +46,23 @@ def calls_of(work):
 
 
 def is_linear(work):
-    """Tell whether twice as much more is not much more than twice the additional work."""
+    """Tell whether work grows linearly, from that of 1, 2 and 4 units."""
     few, some, many = work
     return many - some <= 2.2 * (some - few) + 0.05 * few
 
 
 @pytest.mark.parametrize('grows', ['goals', 'trials', 'points', 'nodes'])
 def test_an_evaluation_calls_linearly_more_functions(grows):
-    found = []
+    calls = []
     for size in (4, 8, 16):
         many = {'goals': 10, 'trials': 1, 'points': 20, 'nodes': 20}
         many[grows] *= size
         trials = [dragged(many['points'], many['goals']) for _ in range(many['trials'])]
         evaluator = Evaluator(trials, ParameterSpace(PAPER_PARAMETERS, mass=0.03),
                               CompiledSimulator(nodes=many['nodes']))
-        evaluator.evaluate(0, np.full(4, 0.5))  # nothing is new any more
-        found.append(calls_of(lambda evaluator=evaluator: evaluator.evaluate(0, np.full(4, 0.5))))
-    assert is_linear(found)
+        evaluator.evaluate(0, np.full(4, 0.5))  # fills the caches
+        calls.append(calls_of(lambda evaluator=evaluator: evaluator.evaluate(0, np.full(4, 0.5))))
+    assert is_linear(calls)
 
 
 class Counting(ToySimulator):
@@ -77,14 +77,14 @@ class Counting(ToySimulator):
 
 
 def test_a_calibration_simulates_linearly_more():
-    found = []
+    rollouts = []
     for size in (5, 10, 20):
         simulator = Counting()
         trials = [toy_trial(TRUTH, f'trial {k}', turn=k / size) for k in range(size)]
         calibrate(trials, Options(workers=1, engine='compiled'),
-                  make_simulator=lambda _, one=simulator: one)
-        found.append(simulator.count)
-    assert is_linear(found)
+                  make_simulator=lambda _, simulator=simulator: simulator)
+        rollouts.append(simulator.count)
+    assert is_linear(rollouts)
 
 
 def test_a_step_of_four_times_the_nodes_takes_far_less_than_sixteen_times_as_long():

@@ -12,7 +12,7 @@ from random_examples import drawing
 
 from dlo_calibration import InputError
 from dlo_calibration.calibration.options import FIXED_VALUES, Options
-from dlo_calibration.model.parameters import BY_NAME, PARAMETERS, REST_SHAPE
+from dlo_calibration.model.parameters import BY_NAME, HANDS, PARAMETERS, REST_SHAPE
 from dlo_calibration.search import SEARCHES
 
 DECLARED = {declaration.name: declaration for declaration in Options.declarations()}
@@ -35,7 +35,7 @@ def test_defaults_are_those_of_the_contract():
 
 
 def test_there_is_an_option_for_every_value_that_is_not_calibrated():
-    assert set(FIXED_VALUES) == {parameter.name for parameter in PARAMETERS} - {'mass'}
+    assert set(FIXED_VALUES) == {parameter.name for parameter in PARAMETERS} - {'mass', *HANDS}
     assert set(FIXED_VALUES) <= set(DECLARED)
 
 
@@ -120,7 +120,7 @@ def test_auto_stands_alone():
 
 
 @pytest.mark.parametrize('names', [[], ['friction', 'friction']])
-def test_a_calibration_of_nothing_or_of_something_twice_is_refused(names):
+def test_a_calibration_of_no_name_or_of_a_name_twice_is_refused(names):
     with pytest.raises(InputError, match='calibrate: .* expected one or more different names'):
         Options.of({'calibrate': names})
 
@@ -135,9 +135,8 @@ def values(declaration):
     if kind is float:
         return st.floats(declaration.minimum, declaration.maximum)
     if kind is tuple:
-        names = st.lists(st.sampled_from([one for one in declaration.choices if one != 'auto']), min_size=1,
-                         unique=True)
-        return names | st.just(['auto'])
+        names = [choice for choice in declaration.choices if choice != 'auto']
+        return st.lists(st.sampled_from(names), min_size=1, unique=True) | st.just(['auto'])
     if declaration.name == 'frame_pose':
         return st.sampled_from(['', '0 0 -0.75 0 0 0 1', '0.1 0.2 1.5 1.0 0 0 0'])
     return st.sampled_from(declaration.choices) if declaration.choices else st.text()
@@ -166,7 +165,7 @@ def test_every_search_can_be_chosen():
     assert DECLARED['search'].choices == tuple(SEARCHES)
 
 
-def test_parts_are_found_where_flexibility_is():
+def test_parts_are_calibrated_if_flexibility_is():
     assert Options().space.parts == 1
     space = Options.of({'calibrate': ['flexibility', 'friction'], 'parts': 3, 'stiffness_5': 70.0}).space
     assert space.free == ('flexibility', 'friction', 'stiffness_2', 'stiffness_3')

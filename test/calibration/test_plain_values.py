@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The plain values of a result are what JSON can hold, and say what is not known."""
+"""The plain values of a result fit JSON, with None for unknown values."""
 
 from dataclasses import replace
 import json
@@ -18,7 +18,7 @@ from dlo_calibration.calibration.result import evaluation_rows, plain, with_null
 
 @pytest.fixture(scope='module')
 def result():
-    """Return what the toy finds from two trials."""
+    """Return the result of the toy for two trials."""
     options = Options.of({'workers': 1, 'evaluations': 20, 'mass': 0.05})
     return calibrate(toy_trials(2), options, make_simulator=new_toy)
 
@@ -41,7 +41,7 @@ def test_unknown_values_are_none(result):
     assert with_nulls({'a': (math.inf, 1.0), 'b': float('nan')}) == {'a': [None, 1.0], 'b': None}
 
 
-def test_evaluations_have_a_row_each_with_what_they_have(result):
+def test_each_evaluation_has_a_row_and_a_failed_one_empty_cells(result):
     failed = replace(result.evaluations[1], scores=(), errors=None, failure='diverged')
     head, rows = evaluation_rows(replace(result, evaluations=(result.evaluations[0], failed)))
     assert all(len(row) == len(head) for row in rows)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Refinement: as many knots of the rest shape and parts as the trials support, no more."""
+"""Refinement: as many knots of the rest shape and parts as the trials support."""
 
 from carried_trials import EVEN, observed, STIFF_MIDDLE, TRUTH
 import pytest
@@ -30,14 +30,14 @@ def stiff_middle():
 
 
 @pytest.fixture(scope='module')
-def found(stiff_middle):
+def divided(stiff_middle):
     seen = []
     return calibrated(stiff_middle, on_evaluation=seen.append), seen
 
 
-def test_a_dlo_that_is_stiffer_in_the_middle_gets_four_parts(found):
-    # In two parts it looks even: only four show it.
-    result, _ = found
+def test_a_dlo_that_is_stiffer_in_the_middle_gets_four_parts(divided):
+    # Two parts cannot show it: both have the same stiffness.
+    result, _ = divided
     assert result.space.parts == 4
     for name, value in STIFF_MIDDLE.items():
         assert result.values[name] == pytest.approx(value, abs=1.5), name
@@ -45,18 +45,19 @@ def test_a_dlo_that_is_stiffer_in_the_middle_gets_four_parts(found):
     assert result.errors.mean < 2e-3
 
 
-def test_every_evaluation_is_counted_and_told_in_the_parts_that_were_found(found):
-    result, seen = found
-    assert [one.index for one in result.evaluations] == [one.index for one in seen] == list(range(len(seen)))
+def test_every_evaluation_counts_and_is_stated_in_the_chosen_parts(divided):
+    result, seen = divided
+    for evaluations in (result.evaluations, seen):
+        assert [evaluation.index for evaluation in evaluations] == list(range(len(seen)))
     assert len(seen) <= 200
-    assert {tuple(one.values) for one in result.evaluations} == {result.space.free}
+    assert {tuple(evaluation.values) for evaluation in result.evaluations} == {result.space.free}
     first = result.evaluations[0].values  # of the even DLO
     assert [first[f'stiffness_{part}'] for part in (2, 3, 4)] == [50, 50, 50]
     assert result.simulations > len(seen) * 4
 
 
-def test_a_dlo_divided_into_equal_parts_is_the_same_dlo(found):
-    result, seen = found
+def test_a_dlo_divided_into_equal_parts_is_the_same_dlo(divided):
+    result, seen = divided
     even = result.evaluations[0]
     simulator = CompiledSimulator(table=False, nodes=21)
     again = Evaluator(result.trials, result.space, simulator).evaluate(0, even.point)
@@ -72,7 +73,7 @@ def test_an_even_dlo_stays_in_one_part():
     assert result.values == calibrated(observed(EVEN, TRUTH), parts=1).values
 
 
-def test_a_rest_shape_is_found_where_the_trials_show_it():
+def test_a_rest_shape_is_recovered_where_the_trials_show_it():
     result = calibrated(observed(CURVED, REST_SHAPE), budget=300, names=('flexibility', 'torsion'))
     assert result.space.knots == 3
     assert result.space.parts == 1
@@ -95,12 +96,12 @@ def test_a_small_budget_leaves_the_dlo_even_and_says_so(stiff_middle):
     assert result.stop_reason.endswith('1 part: the rest of the budget is too small to try 2')
 
 
-def test_without_a_second_trial_nothing_can_be_left_out(stiff_middle):
+def test_one_trial_cannot_be_cross_validated_so_the_dlo_stays_even(stiff_middle):
     assert calibrated(stiff_middle[:1], budget=30).space.free == EVEN.free
 
 
-def test_a_stop_keeps_the_parts_that_were_found(stiff_middle, found):
-    even = next(k for k, one in enumerate(found[1]) if 'stiffness_2' in one.values)
+def test_a_stop_gives_the_parts_so_far(stiff_middle, divided):
+    even = next(k for k, evaluation in enumerate(divided[1]) if 'stiffness_2' in evaluation.values)
     seen = []
     result = calibrated(stiff_middle, on_evaluation=seen.append, should_stop=lambda: len(seen) > even + 3)
     assert result.space.free == EVEN.free

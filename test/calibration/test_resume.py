@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A calibration that is interrupted goes on: nothing is simulated twice, and the result is the same."""
+"""An interrupted calibration continues: nothing is simulated twice, and the result is the same."""
 
 from dataclasses import replace
 
@@ -48,7 +48,7 @@ class Engines:
 
 
 def outcome(result):
-    """Return all that a result tells, without the time that it took."""
+    """Return all values of a result, except for its duration."""
     return repr({**plain(result), 'seconds': 0}), repr(evaluation_rows(result))
 
 
@@ -67,7 +67,7 @@ def trials_of(name):
 @pytest.mark.parametrize('name', [
     pytest.param(name, marks=pytest.mark.long) if name == 'cma-es' else name for name in CHOICES])
 def test_nothing_is_simulated_twice_and_the_result_is_the_same(name, tmp_path):
-    """It is killed in the search, in the examination, while it advises and while another engine confirms."""
+    """The kills hit the search, the examination, the advice and the confirmation by another engine."""
     options, trials, whole = options_of(name), trials_of(name), Engines()
     expected = outcome(calibrate(trials, options, make_simulator=whole))
     assert len(whole.made) == 2
@@ -90,28 +90,28 @@ def test_nothing_is_simulated_twice_and_the_result_is_the_same(name, tmp_path):
 
 @pytest.fixture(scope='module')
 def unkilled(tmp_path_factory):
-    """Return what a calibration tells that nobody kills, and how many rollouts it needs."""
+    """Return the outcome of an uninterrupted calibration, and its number of rollouts."""
     options, whole = options_of('least squares'), Engines()
     with EvaluationLog(tmp_path_factory.mktemp('whole') / 'log') as log:
         return outcome(calibrate(toy_trials(2), options, make_simulator=whole, log=log)), whole.count
 
 
-@pytest.mark.parametrize('left', [
-    *range(1, 60, 14), *(pytest.param(left, marks=pytest.mark.long) for left in range(8, 60, 14))])
-def test_later_stages_simulate_nothing_twice_either(left, unkilled, tmp_path):
+@pytest.mark.parametrize('rest', [
+    *range(1, 60, 14), *(pytest.param(rest, marks=pytest.mark.long) for rest in range(8, 60, 14))])
+def test_later_stages_simulate_nothing_twice_either(rest, unkilled, tmp_path):
     """Advice, missing parameters and confirmation are rollouts: each counts."""
     options, trials = options_of('least squares'), toy_trials(2)
     expected, count = unkilled
     with EvaluationLog(tmp_path / 'log') as log:
         with pytest.raises(Killed):
-            calibrate(trials, options, make_simulator=Engines(last=count - left + 1), log=log)
+            calibrate(trials, options, make_simulator=Engines(last=count - rest + 1), log=log)
         engines = Engines()
         assert outcome(calibrate(trials, options, make_simulator=engines, log=log)) == expected
-    assert left <= engines.count <= left + (len(trials) - 1)  # one evaluation in the examination
+    assert rest <= engines.count <= rest + (len(trials) - 1)  # one evaluation in the examination
 
 
 @pytest.mark.parametrize('first, then', [(1, 2), (2, 1)])
-def test_it_goes_on_with_another_number_of_threads(first, then, tmp_path):
+def test_it_continues_with_another_number_of_threads(first, then, tmp_path):
     trials, seen = toy_trials(3), []
 
     def stop_late(evaluation):
@@ -129,10 +129,10 @@ def test_it_goes_on_with_another_number_of_threads(first, then, tmp_path):
         result = calibrate(trials, options_of('random', then), make_simulator=engines, log=log,
                            on_evaluation=again.append)
     assert outcome(result) == expected
-    assert [one.index for one in again] == list(range(20))
+    assert [evaluation.index for evaluation in again] == list(range(20))
 
 
-def test_a_stopped_calibration_stays_stopped_and_goes_on_when_asked(tmp_path):
+def test_a_stopped_calibration_continues_on_request(tmp_path):
     trials, options = toy_trials(2), options_of('random')
     expected = outcome(calibrate(trials, options, make_simulator=Engines()))
     seen = []
@@ -145,7 +145,7 @@ def test_a_stopped_calibration_stays_stopped_and_goes_on_when_asked(tmp_path):
         assert outcome(calibrate(trials, options, make_simulator=Engines(), log=log)) == expected
 
 
-def test_the_digest_leaves_out_the_machine_and_the_place_of_the_scene(tmp_path):
+def test_the_digest_ignores_the_machine_and_the_path_of_the_scene(tmp_path):
     trials, options = toy_trials(2), Options()
     digest = calibration_digest(trials, options)
     for other in (replace(options, workers=7, output_directory='elsewhere', record=False),):

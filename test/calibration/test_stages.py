@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What is simulated around a fit, on an analytic simulator: the intervals, and the defaults that are kept."""
+"""The examination around a fit, on an analytic simulator: intervals, and defaults that stay."""
 
 from dataclasses import replace
 
@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from toy_simulator import toy_trial, ToySimulator
 
-from dlo_calibration import Goal
 from dlo_calibration.model.parameters import BY_NAME, ParameterSpace
 from dlo_calibration.search import SEARCHES
 
@@ -22,7 +21,7 @@ def search(space, seed=1, name='random'):
     return SEARCHES[name](space.dimension, seed)
 
 
-def found(trials=TRIALS, space=None, simulator=None, seed=1, **rest):
+def calibrated(trials=TRIALS, space=None, simulator=None, seed=1, **rest):
     space = space or ParameterSpace()
     return fitted(trials, space, simulator or ToySimulator(), search(space, seed), seed=seed, **rest)
 
@@ -53,8 +52,8 @@ class Numb(ToySimulator):
         return super().simulate(trial, physical)
 
 
-@pytest.mark.parametrize('default, kept', [(25.0, False), (80.0, True)])
-def test_a_default_that_the_trials_refute_is_not_kept(default, kept):
+@pytest.mark.parametrize('default, stays', [(25.0, False), (80.0, True)])
+def test_a_default_that_the_trials_refute_does_not_stay(default, stays):
     space = ParameterSpace(('flexibility', 'elasticity'), {**TRUTH, 'elasticity': default})
     rough = np.random.default_rng(2)
     trials = [replace(trial, goals=(replace(trial.goals[0], chain=replace(
@@ -63,8 +62,8 @@ def test_a_default_that_the_trials_refute_is_not_kept(default, kept):
     result = fitted(trials, space, Numb(), search(space, name='least_squares'), budget=120)
     elasticity = result.parameters['elasticity']
     assert elasticity.verdict == 'not identifiable'
-    assert (elasticity.value == default) is kept
-    assert ('keeps its default' in elasticity.note) is kept
+    assert (elasticity.value == default) is stays
+    assert ('keeps its default' in elasticity.note) is stays
     assert abs(elasticity.value - TRUTH['elasticity']) < 35
     assert result.best.values == result.values
 
@@ -78,20 +77,21 @@ def test_intervals_of_a_search_that_ends_beside_the_minimum_are_around_its_value
         trials = [replace(trial, goals=(replace(trial.goals[0], chain=replace(
             trial.goals[0].chain, points=trial.goals[0].chain.points + rough.normal(0, 5e-3, (91, 3)))),))
             for trial in (toy_trial(TRUTH, n=91), toy_trial(TRUTH, 'trial 2', n=91, turn=1.0))]
-        result = found(trials, ParameterSpace(free, others), seed=seed)
+        result = calibrated(trials, ParameterSpace(free, others), seed=seed)
         regular += result.examination.regular
-        assert all(one.lower <= one.value <= one.upper for one in result.parameters.values())
+        for estimate in result.parameters.values():
+            assert estimate.lower <= estimate.value <= estimate.upper
         inside += [result.parameters[name].lower <= TRUTH[name] <= result.parameters[name].upper
                    for name in ('flexibility', 'friction')]
-    assert regular > 12  # linear models are what is tested here
+    assert regular > 12  # enough results with the intervals of a linear model
     assert np.mean(inside) >= 0.85
 
 
 def test_the_band_is_the_standard_deviation_of_simulated_points():
-    result = found()
+    result = calibrated()
     model = result.examination
     assert result.band.shape == (22,)
-    # As many points as there are share what the parameters do not know.
+    # The variances of the points add up to the trace of their covariance.
     assert np.sum(result.band**2) == pytest.approx(
         np.trace(model.jacobian @ model.uncertainty.covariance @ model.jacobian.T))
     assert replace(result, examination=None).band is None
@@ -99,7 +99,7 @@ def test_the_band_is_the_standard_deviation_of_simulated_points():
 
 
 class Seeing(ToySimulator):
-    """It remembers the initial chains it began with."""
+    """A toy that records the initial chains of its rollouts."""
 
     def __init__(self):
         super().__init__()
@@ -110,7 +110,7 @@ class Seeing(ToySimulator):
         return super().simulate(trial, physical)
 
 
-@pytest.mark.parametrize(('count', 'more'), [(1, 16), (2, 16), (5, 20), (17, 17)])
+@pytest.mark.parametrize(('count', 'more'), [(1, 32), (2, 32), (5, 35), (17, 34)])
 def test_initial_chains_with_other_noise_are_simulated_where_there_is_noise(count, more):
     generator = np.random.default_rng(1)
 
@@ -118,21 +118,21 @@ def test_initial_chains_with_other_noise_are_simulated_where_there_is_noise(coun
         return replace(chain, points=chain.points + generator.normal(0, 1e-3, chain.points.shape))
 
     exact = [toy_trial(TRUTH, f'trial {k}', n=41) for k in range(count)]
-    trials = [replace(one, initial=noisy(one.initial),
-                      goals=(replace(one.goals[0], chain=noisy(one.goals[0].chain)),)) for one in exact]
+    trials = [replace(trial, initial=noisy(trial.initial),
+                      goals=(replace(trial.goals[0], chain=noisy(trial.goals[0].chain)),)) for trial in exact]
     seen = []
     for _ in range(2):
         simulator = Seeing()
-        found(trials=trials, simulator=simulator, budget=20)
+        calibrated(trials=trials, simulator=simulator, budget=20)
         seen.append(simulator.starts)
     assert len(seen[0]) == count + more
     assert list(seen[0]) == list(seen[1])  # the same each time
     others = list(seen[0].values())[count:]
-    away = [one.initial.points - exact[0].initial.points for one in others]
+    away = [trial.initial.points - exact[0].initial.points for trial in others]
     assert np.std(away) == pytest.approx(1e-3, rel=0.15)
-    assert {one.name for one in others} == {one.name for one in trials}
-    assert all(one.goals == trials[0].goals for one in others if one.name == trials[0].name)
+    assert {trial.name for trial in others} == {trial.name for trial in trials}
+    assert all(trial.goals == trials[0].goals for trial in others if trial.name == trials[0].name)
     smooth = Seeing()
-    still = [replace(one, goals=(Goal(one.initial, 2.0),)) for one in exact]
-    found(trials=still, simulator=smooth, budget=20)
+    still = [toy_trial(dict.fromkeys(TRUTH, 0.0), trial.name, n=41) for trial in exact]
+    calibrated(trials=still, simulator=smooth, budget=20)
     assert len(smooth.starts) == 1

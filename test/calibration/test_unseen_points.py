@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Calibrations on trials of which some points were not seen."""
+"""Calibrations on trials with unseen points."""
 
 from contextlib import closing
 from dataclasses import replace
@@ -24,7 +24,7 @@ POINTS = 16
 
 
 def tracked(points, random, share, ends=False):
-    """Return a chain with noise, of which a share of the points was not seen; with `ends`, both ends were."""
+    """Return a chain with noise and a share of unseen points; with `ends`, both ends are seen."""
     hidden = random.choice(np.arange(ends, POINTS - ends), round(share * POINTS), replace=False)
     seen = points + random.normal(0, 2e-4, points.shape)
     seen[hidden] = np.nan
@@ -44,18 +44,18 @@ def lifted(simulator, space, share):
                    goals=(replace(trial.goals[0], chain=tracked(end, random, share)),))
 
 
-def test_a_parameter_is_recovered_as_well_where_some_points_were_not_seen():
+def test_a_parameter_is_recovered_despite_unseen_points():
     space = ParameterSpace(('flexibility',), {'friction': 40.0})
     with closing(make_simulator(Options.of({'engine': 'compiled'}))) as simulator:
         for share in (0.0, 0.1):
             trial = lifted(simulator, space, share)
             assert (~trial.initial.seen).sum() == (~trial.goals[0].chain.seen).sum() == round(share * POINTS)
-            found = fit(Setting((trial,), Options(), simulator), space, SEARCHES['least_squares'](1, 1), 10)
-            assert found.best.values['flexibility'] == pytest.approx(FLEXIBILITY, abs=1.0)
-            assert found.best.errors.mean < 2e-3
+            result = fit(Setting((trial,), Options(), simulator), space, SEARCHES['least_squares'](1, 1), 10)
+            assert result.best.values['flexibility'] == pytest.approx(FLEXIBILITY, abs=1.0)
+            assert result.best.errors.mean < 2e-3
 
 
-def test_a_result_shows_simulated_chains_whole_and_measured_points_only_where_they_were_seen():
+def test_a_result_shows_whole_simulated_chains_and_only_the_seen_measured_points():
     truth = {'flexibility': 40.0, 'elasticity': 65.0, 'friction': 25.0, 'self_collision': 55.0}
     whole = toy_trial(truth, n=15)
     points = whole.goals[0].chain.points.copy()

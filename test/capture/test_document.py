@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The document of a project: what is not given has a default, and what is wrong is refused."""
+"""The document of a project: missing values have defaults, and wrong ones are refused."""
 
 import copy
 import json
@@ -37,17 +37,17 @@ def changed(path, value):
     """Return the full document with another value at a path of names and indices."""
     plain = copy.deepcopy(FULL)
     place = plain
-    for one in path[:-1]:
-        place = place[one]
+    for name in path[:-1]:
+        place = place[name]
     place[path[-1]] = value
     return plain
 
 
-def test_a_document_is_the_same_after_it_was_read():
+def test_a_document_keeps_all_its_values():
     assert Document.of(FULL).plain() == json.loads(json.dumps(FULL))
 
 
-def test_what_is_not_given_has_a_default():
+def test_a_missing_value_has_its_default():
     plain = Document.of({'photographs': [{'id': A}], 'trials': [{'start': A, 'steps': [
         {'kind': kind} for kind in KINDS]}]}).plain()
     assert plain['dlo'] == {'diameter': None, 'mass': 0.0, 'points': 21}
@@ -102,7 +102,7 @@ for _ in range(500):
     (('trials', 0, 'steps', 2, 'fractions'), [0.5], 'trial 1, step 3, fractions'),
     (('trials', 0, 'steps', 2, 'moving'), 'none', 'trial 1, step 3, moving'),
 ])
-def test_what_is_wrong_is_refused_with_its_place(path, value, place):
+def test_a_wrong_value_is_refused_with_its_place(path, value, place):
     with pytest.raises(InputError) as caught:
         Document.of(changed(path, value))
     assert caught.value.thing == place
@@ -110,13 +110,13 @@ def test_what_is_wrong_is_refused_with_its_place(path, value, place):
 
 
 @pytest.mark.parametrize('plain', [None, [], 'text', 1])
-def test_something_else_is_no_document(plain):
+def test_other_values_than_objects_are_no_document(plain):
     with pytest.raises(InputError, match='document'):
         Document.of(plain)
 
 
-def test_photographs_take_their_places_in_trials():
+def test_each_new_photograph_gets_its_place_in_a_trial():
     document = Document()
-    for one in (A, B, C):
-        document = document.with_photograph(PhotographEntry(one))
+    for identity in (A, B, C):
+        document = document.with_photograph(PhotographEntry(identity))
     assert [(trial.start, trial.goal) for trial in document.trials] == [(A, B), (B, C)]

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""From the photographs in a folder to trials, and what is computed anew after a change."""
+"""From the photographs in a folder to trials; a change costs only what depends on it."""
 
 import io
 import json
@@ -72,29 +72,29 @@ def traced(monkeypatch):
     return seen
 
 
-def test_photographs_become_a_trial_and_only_what_changed_is_traced_again(project, traced):
+def test_photographs_become_a_trial_and_only_changed_clicks_are_traced_again(project, traced):
     drafter = Drafter(project)
-    found = drafter.draft()
-    trial, = found.complete
+    drafts = drafter.draft()
+    trial, = drafts.complete
     for chain, shape in ((trial.initial, SHAPES[0]), (trial.goals[0].chain, SHAPES[1])):
         nearest = np.linalg.norm(chain.points[:, None] - shape[None], axis=2).min(axis=1)
         assert nearest.max() < 3e-3  # m; a pixel is 0.9 mm
         assert chain.length == pytest.approx(0.5, abs=5e-3)
-    assert found.diameter == pytest.approx(DIAMETER, rel=0.35)
-    plain = json.loads(json.dumps(found.plain(), allow_nan=False))
+    assert drafts.diameter == pytest.approx(DIAMETER, rel=0.35)
+    plain = json.loads(json.dumps(drafts.plain(), allow_nan=False))
     shown = list(plain['photographs'].values())
-    assert [len(one['trace']['chain']) for one in shown] == [21, 21]
+    assert [len(photograph['trace']['chain']) for photograph in shown] == [21, 21]
     np.testing.assert_allclose(shown[0]['scale']['pixels'], PLACES, atol=0.01)
     assert shown[1]['scale']['pixels'] == []  # they belong to the other photograph
-    for number, one in enumerate(shown):  # with which the page places what is clicked
-        lattice, scale = one['scale']['lattice'], list(found.photographs.values())[number].scale
+    for photograph, measured in zip(shown, drafts.photographs.values(), strict=True):
+        lattice, scale = photograph['scale']['lattice'], measured.scale  # the page's map to the table
         for row in (0, -1):
             pixels = [(u, lattice['rows'][row]) for u in lattice['columns']]
             np.testing.assert_allclose(lattice['table'][row], scale.to_table(pixels)[:, :2], atol=1e-5)
     assert plain['trials'][0]['complete'] is True
     assert len(traced) == 2
 
-    assert drafter.draft().plain() == found.plain()
+    assert drafter.draft().plain() == drafts.plain()
     change(project, lambda plain: plain['trials'][0]['steps'][0].update(fraction=0.6))
     change(project, lambda plain: plain['dlo'].update(diameter=0.01, mass=0.03, points=31))
     again = drafter.draft()
@@ -112,17 +112,17 @@ def test_photographs_become_a_trial_and_only_what_changed_is_traced_again(projec
     (lambda start: start.update(clicks=[[5, 5], [99999, 5]]), 'trace_problem', 'click 2'),
     (lambda start: start.update(scale={'kind': 'board'}), 'scale_problem', 'board'),
 ])
-def test_what_is_wrong_in_one_photograph_leaves_the_other(project, edit, problem, text):
+def test_a_fault_in_one_photograph_leaves_the_other(project, edit, problem, text):
     change(project, lambda plain: edit(plain['photographs'][0]))
     plain = Drafter(project).draft().plain()
     start, goal = plain['photographs'].values()
     assert text in start[problem]
     assert goal['trace'] is not None
     assert plain['trials'][0]['complete'] is False
-    assert any(start[problem] in one['text'] for one in plain['trials'][0]['remarks'])
+    assert any(start[problem] in warning['text'] for warning in plain['trials'][0]['warnings'])
 
 
-def test_what_was_prepared_is_used(project, monkeypatch):
+def test_a_prepared_photograph_is_used(project, monkeypatch):
     made = []
 
     class Tracer(measurement.Tracer):
@@ -146,17 +146,17 @@ def test_a_defect_in_one_photograph_leaves_the_others(project, monkeypatch):
 
     monkeypatch.setattr(measurement.Tracer, 'trace', trace)
     plain = Drafter(project).draft().plain()
-    for one in plain['photographs'].values():
-        assert 'ZeroDivisionError' in one['trace_problem']
-        assert one['scale'] is not None
+    for photograph in plain['photographs'].values():
+        assert 'ZeroDivisionError' in photograph['trace_problem']
+        assert photograph['scale'] is not None
 
 
-def test_a_file_that_became_unreadable_is_told(project):
-    one = project.document.photographs[0].id
-    project.path(one).write_bytes(b'damaged')
+def test_a_file_that_became_unreadable_is_reported(project):
+    identity = project.document.photographs[0].id
+    project.path(identity).write_bytes(b'damaged')
     project.close()
     opened = Project(project.folder)
     plain = Drafter(opened).draft().plain()
     opened.close()
-    assert 'photograph rope.png' in plain['photographs'][one]['problem']
-    assert plain['trials'][0]['remarks'][0]['level'] == 'error'
+    assert 'photograph rope.png' in plain['photographs'][identity]['problem']
+    assert plain['trials'][0]['warnings'][0]['level'] == 'error'

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The folder of a project: kept, opened again, damaged, and made by a stranger."""
+"""The folder of a project: written, opened again, damaged, and made by a stranger."""
 
 import io
 import json
@@ -38,29 +38,29 @@ def project(tmp_path):
     opened.close()
 
 
-def again(project):
+def reopened(project):
     project.close()
     opened = Project(project.folder)
     opened.close()
     return opened
 
 
-def test_what_was_done_is_there_when_the_folder_is_opened_again(project):
-    one = project.add_photograph(picture('JPEG'), 'start.jpg')
-    two = project.add_photograph(picture(), 'goal.png')
+def test_what_was_done_is_there_when_the_folder_is_opened_reopened(project):
+    first = project.add_photograph(picture('JPEG'), 'start.jpg')
+    second = project.add_photograph(picture(), 'goal.png')
     project.set_lens(LENS.encode(), 'my camera.yaml')
     plain = project.document.plain()
     plain['photographs'][0]['clicks'] = [[1, 2], [3.5, 4]]
     project.change(Document.of(plain), project.revision)
-    opened = again(project)
+    opened = reopened(project)
     assert opened.document == project.document
-    assert [(trial.start, trial.goal) for trial in opened.document.trials] == [(one, two)]
-    np.testing.assert_array_equal(opened.photograph(two).pixels, project.photograph(two).pixels)
-    assert (opened.path(one).suffix, opened.path(two).suffix) == ('.jpg', '.png')
+    assert [(trial.start, trial.goal) for trial in opened.document.trials] == [(first, second)]
+    np.testing.assert_array_equal(opened.photograph(second).pixels, project.photograph(second).pixels)
+    assert (opened.path(first).suffix, opened.path(second).suffix) == ('.jpg', '.png')
     assert opened.lens.size == (200, 150)
-    assert opened.problems == []
+    assert opened.warnings == []
     opened.remove_lens()
-    assert again(opened).lens is None
+    assert reopened(opened).lens is None
 
 
 def test_a_change_of_an_old_revision_is_refused(project):
@@ -71,16 +71,16 @@ def test_a_change_of_an_old_revision_is_refused(project):
     assert len(project.document.photographs) == 1
 
 
-def test_a_photograph_that_was_removed_can_be_brought_back(project):
+def test_a_removed_photograph_can_be_restored(project):
     project.add_photograph(picture(), 'start.png')
     before = project.document
     project.change(Document(), project.revision)
-    project = again(project)
+    project = reopened(project)
     project.change(before, project.revision)
-    assert again(project).document == before
+    assert reopened(project).document == before
 
 
-def test_a_document_with_a_photograph_that_is_not_there_is_refused(project):
+def test_a_document_with_an_unknown_photograph_is_refused(project):
     plain = {'photographs': [{'id': 'aaaaaaaa'}]}
     with pytest.raises(InputError, match='photograph aaaaaaaa'):
         project.change(Document.of(plain), project.revision)
@@ -88,17 +88,17 @@ def test_a_document_with_a_photograph_that_is_not_there_is_refused(project):
 
 
 def test_the_next_photograph_has_the_board_too(project):
-    one = project.add_photograph(picture(), 'start.png')
-    assert project.document.by_id[one].scale is None
+    first = project.add_photograph(picture(), 'start.png')
+    assert project.document.by_id[first].scale is None
     plain = project.document.plain()
     plain['photographs'][0]['scale'] = {'kind': 'board', 'ruler': 0.098}
     project.change(Document.of(plain), project.revision)
-    two = project.add_photograph(picture(), 'goal.png')
-    assert project.document.by_id[two].scale == project.document.by_id[one].scale
+    second = project.add_photograph(picture(), 'goal.png')
+    assert project.document.by_id[second].scale == project.document.by_id[first].scale
 
 
 @pytest.mark.parametrize('octets', [b'', b'a text file', picture('JPEG')[:300], picture('GIF')])
-def test_what_is_no_photograph_is_not_kept(project, octets):
+def test_a_file_that_is_no_photograph_is_not_saved(project, octets):
     with pytest.raises(InputError):
         project.add_photograph(octets, 'start.jpg')
     assert project.document == Document()
@@ -106,18 +106,18 @@ def test_what_is_no_photograph_is_not_kept(project, octets):
 
 
 def test_a_name_is_only_shown(project):
-    one = project.add_photograph(picture(), '../../etc/\x1b[31mpasswd' + 'x' * 1000)
-    assert project.path(one).parent == project.folder / 'photographs'
-    shown = project.document.by_id[one].name
+    first = project.add_photograph(picture(), '../../etc/\x1b[31mpasswd' + 'x' * 1000)
+    assert project.path(first).parent == project.folder / 'photographs'
+    shown = project.document.by_id[first].name
     assert len(shown) <= 255
     assert '\x1b' not in shown
 
 
-@pytest.mark.parametrize('one', ['../secret', 'aaaaaaaa/', 'AAAAAAAA', '', 'aaaaaaaa\n', 'a' * 8 + '\0'])
-def test_an_id_is_no_path(project, one):
+@pytest.mark.parametrize('identity', ['../secret', 'aaaaaaaa/', 'AAAAAAAA', '', 'aaaaaaaa\n', 'a' * 8 + '\0'])
+def test_an_id_is_no_path(project, identity):
     (project.folder / 'secret.png').write_bytes(picture())
     with pytest.raises(InputError):
-        project.path(one)
+        project.path(identity)
 
 
 def test_a_link_in_place_of_a_photograph_is_not_followed(project, tmp_path):
@@ -150,7 +150,7 @@ def test_a_bad_lens_leaves_the_good_one(project):
         with pytest.raises(InputError, match='camera calibration bad.yaml'):
             project.set_lens(octets, 'bad.yaml')
     assert project.lens_name == 'good.yaml'
-    assert again(project).lens is not None
+    assert reopened(project).lens is not None
 
 
 DAMAGED = {
@@ -161,14 +161,14 @@ DAMAGED = {
 
 
 @pytest.mark.parametrize('octets', DAMAGED.values(), ids=DAMAGED)
-def test_a_damaged_document_is_kept_aside_and_told(project, octets):
+def test_a_damaged_document_is_renamed_and_reported(project, octets):
     (project.folder / 'project.json').write_bytes(octets)
-    opened = again(project)
+    opened = reopened(project)
     assert opened.document == Document()
-    assert 'project_damaged_1.json' in opened.problems[0]
+    assert 'project_damaged_1.json' in opened.warnings[0]
     assert (project.folder / 'project_damaged_1.json').read_bytes() == octets
     opened.add_photograph(picture(), 'new.png')
-    assert again(opened).problems == []
+    assert reopened(opened).warnings == []
 
 
 def test_a_folder_is_open_in_one_process_only(project):
@@ -176,7 +176,7 @@ def test_a_folder_is_open_in_one_process_only(project):
         Project(project.folder)
 
 
-def test_a_full_folder_is_told(project):
+def test_a_full_folder_is_refused(project):
     for number in range(MOST_FILES):
         (project.folder / 'photographs' / f'{number:08}.jpg').touch()
     with pytest.raises(InputError, match='another folder'):

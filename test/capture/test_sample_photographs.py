@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The sample photographs of msg_samples, with the clicks of somebody who has never seen the truth."""
+"""The sample photographs of msg_samples, with clicks made without knowing the truth."""
 
 import json
 from pathlib import Path
@@ -20,7 +20,7 @@ TRUTH = json.loads((SAMPLE / 'truth.json').read_text(encoding='utf-8'))
 
 @pytest.fixture(scope='module')
 def drafts(tmp_path_factory):
-    """Return what the capture page makes of the sample, and the ids of the photographs."""
+    """Return the drafts of the sample, and the ids of its photographs."""
     photographs = {name: ((SAMPLE / name).read_bytes(), clicks) for name, clicks in CLICKS.items()}
     opened = [trial['hand'][-1][:2] for trial in TRUTH['trials']]  # at the stickers
     trials = [{'start': 'first.jpg', 'goal': 'second.jpg', 'steps': [
@@ -36,8 +36,8 @@ def test_chains_of_the_sample_are_those_of_the_simulated_rope(drafts):
     assert len(trials) == 2
     chains = [trials[0].initial, trials[0].goals[0].chain, trials[1].goals[0].chain]
     for chain, name in zip(chains, CLICKS, strict=True):
-        away = np.linalg.norm(chain.points - TRUTH['photographs'][name], axis=1)
-        assert away.mean() < 0.001 and away.max() < 0.0025, name
+        errors = np.linalg.norm(chain.points - TRUTH['photographs'][name], axis=1)
+        assert errors.mean() < 0.001 and errors.max() < 0.0025, name
         assert chain.length == pytest.approx(TRUTH['length_m'], rel=0.005)
 
 
@@ -45,9 +45,9 @@ def test_chains_of_the_sample_are_those_of_the_simulated_rope(drafts):
 def test_parameters_of_the_sample_lie_in_their_intervals(drafts):
     read, _ = drafts
     options = Options.of({**read.options, 'engine': 'compiled', 'workers': 1, 'evaluations': 80})
-    found = calibrate(read.complete, options, make_simulator=make_simulator).parameters
+    parameters = calibrate(read.complete, options, make_simulator=make_simulator).parameters
     for name in ('flexibility', 'friction'):
-        one = found[name]
-        assert one.verdict == 'identifiable'
-        assert one.lower < TRUTH['parameters'][name]['value'] < one.upper
-        assert one.upper - one.lower < 10
+        estimate = parameters[name]
+        assert estimate.verdict == 'identifiable'
+        assert estimate.lower < TRUTH['parameters'][name]['value'] < estimate.upper
+        assert estimate.upper - estimate.lower < 10

@@ -79,24 +79,26 @@ def only_json(output):
 
 def test_fit_prints_one_document_with_every_key(run, session):
     code, output, _ = run('fit', session, '--json')
-    found = only_json(output)
+    printed = only_json(output)
     assert code == 0
-    assert set(found) >= FIT_KEYS
-    assert list(found['parameters']) == list(PAPER_PARAMETERS)
-    assert all(set(one) == PARAMETER_KEYS for one in found['parameters'].values())
-    assert (found['trials'], found['evaluations']) == (2, 20)
-    assert found['simulations'] > 40  # what was examined around the result counts
-    assert (found['engine'], found['search'], found['seed']) == ('toy', 'least_squares', 1)
-    assert len(found['scores']) == 2
-    assert found['score'] == pytest.approx(sum(found['scores']) / 2)
-    assert found['mean_error_m'] <= found['rms_error_m'] <= found['max_error_m']
-    assert found['error_percent_of_length'] == pytest.approx(100 * found['mean_error_m'], rel=0.01)  # of 1 m
+    assert set(printed) >= FIT_KEYS
+    assert list(printed['parameters']) == list(PAPER_PARAMETERS)
+    assert all(set(estimate) == PARAMETER_KEYS for estimate in printed['parameters'].values())
+    assert (printed['trials'], printed['evaluations']) == (2, 20)
+    assert printed['simulations'] > 40  # what was examined around the result counts
+    assert (printed['engine'], printed['search'], printed['seed']) == ('toy', 'least_squares', 1)
+    assert len(printed['scores']) == 2
+    assert printed['score'] == pytest.approx(sum(printed['scores']) / 2)
+    assert printed['mean_error_m'] <= printed['rms_error_m'] <= printed['max_error_m']
+    assert printed['error_percent_of_length'] == pytest.approx(
+        100 * printed['mean_error_m'], rel=0.01)  # of 1 m
 
 
 def test_fit_gives_what_the_library_gives(run, session):
-    found = only_json(run('fit', session, '--json')[1])
+    printed = only_json(run('fit', session, '--json')[1])
     result = calibrate(toy_trials(2), Options.of({'evaluations': 20}), make_simulator=new_toy)
-    assert {name: one['value'] for name, one in found['parameters'].items()} == pytest.approx(result.values)
+    values = {name: estimate['value'] for name, estimate in printed['parameters'].items()}
+    assert values == pytest.approx(result.values)
 
 
 def test_flags_come_before_recorded_options_and_say_so(run, session):
@@ -107,14 +109,14 @@ def test_flags_come_before_recorded_options_and_say_so(run, session):
 
 
 def test_correlations_are_between_the_parameters_by_name(run, session):
-    found = only_json(run('fit', session, '--json', '--evaluations', 150)[1])
+    printed = only_json(run('fit', session, '--json', '--evaluations', 150)[1])
     names = list(PAPER_PARAMETERS)
-    assert list(found['correlations']) == names
-    for one in names:
-        assert list(found['correlations'][one]) == names
-        assert found['correlations'][one][one] == pytest.approx(1)
+    assert list(printed['correlations']) == names
+    for name in names:
+        assert list(printed['correlations'][name]) == names
+        assert printed['correlations'][name][name] == pytest.approx(1)
         for other in names:
-            assert found['correlations'][one][other] == pytest.approx(found['correlations'][other][one])
+            assert printed['correlations'][name][other] == pytest.approx(printed['correlations'][other][name])
 
 
 def test_every_key_of_the_document_is_documented():
@@ -202,35 +204,35 @@ def test_an_interrupt_before_the_first_evaluation_leaves_no_files(run, session, 
 def test_validate_simulates_the_result_and_fits_nothing(run, session, tmp_path):
     fitted = only_json(run('fit', session, '--json', '--output', tmp_path / 'out')[1])
     code, output, _ = run('validate', tmp_path / 'out' / 'result.xml', session, '--json')
-    found = only_json(output)
+    printed = only_json(output)
     assert code == 0
-    assert set(found) >= FIT_KEYS
-    assert found['parameters'] == fitted['parameters']
-    assert (found['score'], found['scores']) == (fitted['score'], fitted['scores'])
-    assert found['mean_error_m'] == fitted['mean_error_m']
-    assert (found['evaluations'], found['simulations']) == (1, 2)
+    assert set(printed) >= FIT_KEYS
+    assert printed['parameters'] == fitted['parameters']
+    assert (printed['score'], printed['scores']) == (fitted['score'], fitted['scores'])
+    assert printed['mean_error_m'] == fitted['mean_error_m']
+    assert (printed['evaluations'], printed['simulations']) == (1, 2)
 
 
 def test_validate_on_another_session_uses_the_results_parameters(run, session, tmp_path):
     run('fit', session, '--output', tmp_path / 'out')
     other = write_session(tmp_path / 'other.mcap', session_messages(TYPES, 1, first=4), {'seed': 5})
-    found = only_json(run('validate', tmp_path / 'out' / 'result.xml', other, '--json')[1])
-    assert found['trials'] == 1
-    assert found['seed'] == 1
+    printed = only_json(run('validate', tmp_path / 'out' / 'result.xml', other, '--json')[1])
+    assert printed['trials'] == 1
+    assert printed['seed'] == 1
 
 
 def test_info_shows_the_content_of_a_session(run, session):
     code, output, _ = run('info', session, '--json')
-    found = only_json(output)
+    printed = only_json(output)
     assert code == 0
-    assert [trial['name'] for trial in found['trials']] == ['trial 1', 'trial 2']
-    trial = found['trials'][0]
+    assert [trial['name'] for trial in printed['trials']] == ['trial 1', 'trial 2']
+    trial = printed['trials'][0]
     assert (trial['points'], trial['stable_goals'], trial['timed_goals']) == (11, 1, 0)
     assert trial['length_m'] == pytest.approx(1.0)
     assert [hand['name'] for hand in trial['hands']] == ['left_hand']
-    assert found['frames'] == ['world']
-    assert found['refusals'] == found['problems'] == []
-    assert found['calibrate'] == list(PAPER_PARAMETERS)
+    assert printed['frames'] == ['world']
+    assert printed['refusals'] == printed['problems'] == []
+    assert printed['calibrate'] == list(PAPER_PARAMETERS)
     for_people = run('info', session)[1]
     assert 'left_hand' in for_people
     assert 'Calibrated' not in for_people and 'evaluations 20' in for_people
@@ -241,9 +243,9 @@ def test_info_says_how_many_chains_a_goal_averages(run, tmp_path):
     (_, goal), = (pair for pair in messages if pair[0] == GOAL)
     later = []
     for k in range(1, 40):
-        one = copy.deepcopy(goal)
-        one.header.stamp.sec += k
-        later.append((GOAL, one))
+        copied = copy.deepcopy(goal)
+        copied.header.stamp.sec += k
+        later.append((GOAL, copied))
     code, output, _ = run('info', write_session(tmp_path / 'stream.mcap', [*messages, *later]), '--json')
     trial, = only_json(output)['trials']
     assert (code, trial['stable_goals'], trial['timed_goals']) == (0, 1, 0)
@@ -251,15 +253,33 @@ def test_info_says_how_many_chains_a_goal_averages(run, tmp_path):
     assert f"mean of {trial['averaged_chains']}" in run('info', tmp_path / 'stream.mcap')[1]
 
 
+def test_the_goals_of_a_tracker_that_is_on_already_are_a_note_and_no_refusal(run, session, tmp_path):
+    messages = session_messages(TYPES, 2)
+    (_, goal), *_ = (pair for pair in messages if pair[0] == GOAL)
+    earlier = []
+    for k in range(5):
+        copied = copy.deepcopy(goal)
+        copied.header.stamp.sec -= 40 - k
+        earlier.append((GOAL, copied))
+    path = write_session(tmp_path / 'stream.mcap', [*earlier, *messages])
+    printed, note = only_json(run('info', path, '--json')[1]), 'came before the first initial chain; not used'
+    assert (len(printed['trials']), printed['refusals'], printed['problems']) == (2, [], [])
+    assert [text.endswith(f'and 4 more: {note}') for text in printed['notes']] == [True]
+    assert re.search(f'note: goal_chain .* and 4 more: {note}', ' '.join(run('info', path)[1].split()))
+    run('fit', session, '--output', tmp_path / 'out')
+    errors = run('validate', tmp_path / 'out/result.xml', path)[2]
+    assert note in errors and 'send the chain before' not in errors
+
+
 def test_info_shows_the_warnings_about_a_session(run, tmp_path):
     pairs = session_messages(TYPES, 2)
     pairs[5][1].header.frame_id = 'camera'
     path = write_session(tmp_path / 'wrong.mcap', pairs)
     code, output, _ = run('info', path, '--json')
-    found = only_json(output)
+    printed = only_json(output)
     assert code == 0
-    assert len(found['trials']) == 1
-    assert any('camera' in text for text in found['refusals'])
+    assert len(printed['trials']) == 1
+    assert any('camera' in text for text in printed['refusals'])
     assert 'camera' in run('fit', path, '--json', '--evaluations', 2)[2]
 
 
@@ -280,7 +300,7 @@ def test_session_without_complete_trial_is_refused_by_fit_and_described_by_info(
     ['fit', 'SESSION', '--output', 'TEXT'], ['fit', 'SESSION', '--eval', '3'],
 ], ids=' '.join)
 @pytest.mark.parametrize('as_json', [False, True], ids=['', 'json'])
-def test_what_cannot_be_used_ends_with_one_line_and_exit_code_2(run, session, tmp_path, words, as_json):
+def test_unusable_input_ends_with_one_line_and_exit_code_2(run, session, tmp_path, words, as_json):
     text = tmp_path / 'text'
     text.write_text('nothing of ours')
     names = {'SESSION': session, 'TEXT': text}
@@ -314,21 +334,21 @@ def test_every_option_is_a_flag_with_either_hyphen(run, session):
 
 def test_lists_are_given_as_words_or_with_commas(run, session):
     for words in (['flexibility', 'friction'], ['flexibility,friction']):
-        found = only_json(run('fit', session, '--json', '--calibrate', *words)[1])
-        assert list(found['parameters']) == ['flexibility', 'friction']
+        printed = only_json(run('fit', session, '--json', '--calibrate', *words)[1])
+        assert list(printed['parameters']) == ['flexibility', 'friction']
 
 
 def test_an_option_that_is_no_parameter_of_the_search_stays_at_its_value(run, session):
     flags = [f for name in ('elasticity', 'friction', 'self_collision') for f in (f'--{name}', TRUTH[name])]
     flags += ['--calibrate', 'flexibility', '--evaluations', 200]
-    found = only_json(run('fit', session, '--json', *flags)[1])
-    assert found['parameters']['flexibility']['value'] == pytest.approx(TRUTH['flexibility'], abs=1)
+    printed = only_json(run('fit', session, '--json', *flags)[1])
+    assert printed['parameters']['flexibility']['value'] == pytest.approx(TRUTH['flexibility'], abs=1)
 
 
 def test_stiffness_is_per_weight_unless_the_mass_is_given(run, session):
     def unit(*flags):
-        found = only_json(run('fit', session, '--json', *flags)[1])
-        return found['parameters']['flexibility']['physical_unit']
+        printed = only_json(run('fit', session, '--json', *flags)[1])
+        return printed['parameters']['flexibility']['physical_unit']
 
     assert unit() == 'N m^2 per N/m'
     assert unit('--mass', '0.05') == 'N m^2'
@@ -420,10 +440,11 @@ def test_a_session_with_a_scene_is_repeated_with_it(tmp_path, monkeypatch, capsy
     for words in ([str(session), '--output', 'out'], ['out/session.mcap', '--scene', str(scene)]):
         assert cli.main(['fit', *words, '--workers', '1', '--json']) == 0
         documents.append(json.loads(capsys.readouterr().out))
-    first, again = ({key: value for key, value in one.items() if key != 'seconds'} for one in documents)
+    first, again = ({key: value for key, value in document.items() if key != 'seconds'}
+                    for document in documents)
     assert first == again
     assert (first['engine'], first['confirmation']) == ('bullet', None)
-    assert read_result('out/result.xml').refusal is not None  # it is not in the folder of this file
+    assert read_result('out/result.xml').file_options.refusal is not None  # not in its folder
     assert f"--scene '{scene}'" in html.unescape(Path('out/report.html').read_text(encoding='utf-8'))
     assert cli.main(['validate', 'out/result.xml', str(session), '--json']) == 0
     assert json.loads(capsys.readouterr().out)['score'] == first['score']

@@ -59,7 +59,7 @@ def trials_of(data, *arguments):
     session = read_session(data / 'out')
     options = session.options
     trials, refusals = session_trials(session, options)
-    assert (session.problems, refusals) == ((), ())
+    assert (session.warnings, refusals) == ((), ())
     return trials, options
 
 

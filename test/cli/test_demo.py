@@ -47,7 +47,7 @@ def test_demo_ends_with_a_table_a_result_and_a_picture(ros_environment, tmp_path
     assert (tmp_path / 'out' / 'demo.png').read_bytes().startswith(b'\x89PNG')
     folder, = (tmp_path / 'out').glob('dlo_session_*')
     assert (folder / 'result.xml').exists()
-    assert read_session(folder).problems == ()
+    assert read_session(folder).warnings == ()
 
 
 @pytest.mark.long
@@ -75,5 +75,5 @@ def test_demo_says_what_is_wrong_with_a_sample(ros_environment, tmp_path):
     assert 'nowhere' in errors
 
 
-def test_samples_are_found():
+def test_the_sample_sessions_are_there():
     assert (samples() / 'object1').is_dir()

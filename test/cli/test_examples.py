@@ -56,7 +56,7 @@ def test_closed_loop_plans_and_executes_until_the_goal_is_reached(ros_environmen
     finally:
         planner.kill()
         planner.communicate()
-    before, predicted, after = (float(one) for one in re.findall(r'([\d.]+) % of its length', heard))
+    before, predicted, after = (float(number) for number in re.findall(r'([\d.]+) % of its length', heard))
     assert before > 20
     assert predicted < 12 and after < 12
     assert abs(after - predicted) < 2

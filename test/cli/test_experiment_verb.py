@@ -62,10 +62,10 @@ def undrawn(monkeypatch):
 
 def timeless(text):
     """Return a JSON document without how long anything lasted."""
-    found = json.loads(text)
-    for one in found['findings']:
-        one.pop('seconds')
-    return found
+    printed = json.loads(text)
+    for finding in printed['findings']:
+        finding.pop('seconds')
+    return printed
 
 
 def test_all_files_are_written_and_the_tables_printed(run, session, tmp_path):
@@ -91,23 +91,23 @@ def test_all_files_are_written_and_the_tables_printed(run, session, tmp_path):
 def test_the_json_document_is_the_file_and_has_the_recovered_truth(run, session, tmp_path, undrawn):
     code, output, _ = run(session, '--runs', 2, '--search', 'least_squares', '--json',
                           '--output', tmp_path / 'out')
-    found = json.loads(output)
+    printed = json.loads(output)
     assert code == 0
-    assert found == json.loads((tmp_path / 'out' / 'experiment.json').read_text())
-    assert found['complete']
-    assert found['evaluations'] == {'least_squares': 150 + 400}
-    one, = found['findings']
-    means = {name: spread['mean'] for name, spread in one['parameters'].items()}
+    assert printed == json.loads((tmp_path / 'out' / 'experiment.json').read_text())
+    assert printed['complete']
+    assert printed['evaluations'] == {'least_squares': 150 + 400}
+    finding, = printed['findings']
+    means = {name: spread['mean'] for name, spread in finding['parameters'].items()}
     assert means == pytest.approx(TRUTH, abs=0.5)
-    assert one['score']['mean'] < 1
-    assert one['very_similar'] == 2
-    assert set(one['actions']) == {'trial 1', 'trial 2', 'trial 3'}
+    assert finding['score']['mean'] < 1
+    assert finding['very_similar'] == 2
+    assert set(finding['actions']) == {'trial 1', 'trial 2', 'trial 3'}
 
 
 def test_the_numbers_are_the_same_for_any_number_of_processes(run, session, tmp_path, undrawn):
-    one = run(session, *SMALL, '--json', '--output', tmp_path / 'one')[1]
-    two = run(session, *SMALL, '--json', '--output', tmp_path / 'two', workers=2)[1]
-    first, second = timeless(one), timeless(two)
+    serial = run(session, *SMALL, '--json', '--output', tmp_path / 'one')[1]
+    parallel = run(session, *SMALL, '--json', '--output', tmp_path / 'two', workers=2)[1]
+    first, second = timeless(serial), timeless(parallel)
     assert first.pop('command') != second.pop('command')  # it names the processes
     assert first == second
 
@@ -139,27 +139,27 @@ def test_another_session_or_option_in_the_same_folder_is_not_mixed_up(run, sessi
 
 
 def test_chosen_trials_are_held_back(run, session, tmp_path, undrawn):
-    found = json.loads(run(session, *SMALL, '--held-back', 2, '--json', '--output', tmp_path / 'out')[1])
-    assert [list(one['actions']) for one in found['findings']] == [['trial 2']]
-    assert '--held-back 2' in found['command']
+    printed = json.loads(run(session, *SMALL, '--held-back', 2, '--json', '--output', tmp_path / 'out')[1])
+    assert [list(finding['actions']) for finding in printed['findings']] == [['trial 2']]
+    assert '--held-back 2' in printed['command']
 
 
 def test_parameters_are_validated_on_another_session(run, session, tmp_path, undrawn):
     other = write_session(tmp_path / 'other.mcap', session_messages(bag_types(), 2, first=3), {'seed': 3})
     code, output, _ = run(session, '--runs', 2, '--search', 'least_squares', '--validate-on', other, '--json',
                           '--output', tmp_path / 'out')
-    one, = json.loads(output)['findings']
+    finding, = json.loads(output)['findings']
     assert code == 0
-    assert list(one['actions']) == ['trial 1', 'trial 2']  # of the other session
-    assert one['score']['mean'] < 1
+    assert list(finding['actions']) == ['trial 1', 'trial 2']  # of the other session
+    assert finding['score']['mean'] < 1
     assert len((tmp_path / 'out' / 'calibrations.jsonl').read_text().splitlines()) == 2
 
 
-def test_sessions_of_one_name_stay_apart(run, session, tmp_path, undrawn):
+def test_sessions_of_one_name_are_distinguished(run, session, tmp_path, undrawn):
     other = write_session(tmp_path / 'other' / 'rope.mcap', session_messages(bag_types(), 3, first=2))
-    found = json.loads(run(session, other, '--runs', 1, '--search', 'random', '--evaluations', 4, '--json',
+    printed = json.loads(run(session, other, '--runs', 1, '--search', 'random', '--evaluations', 4, '--json',
                            '--output', tmp_path / 'out')[1])
-    assert [one['subject'] for one in found['findings']] == ['rope', 'rope_2']
+    assert [finding['subject'] for finding in printed['findings']] == ['rope', 'rope_2']
     assert (tmp_path / 'out' / 'rope_2_random.png').exists()
 
 
@@ -231,12 +231,13 @@ def test_files_that_cannot_be_written_are_named_and_the_tables_are_printed(run, 
     assert (code, output) == (2, (out / 'experiment.md').read_text())
     assert ('could not be written: consistency.csv, validity.csv, calibrations.csv: No space left on device; '
             'experiment.md, experiment.json') in errors.splitlines()[-1]
-    assert not {'validity.csv', 'consistency.csv', 'calibrations.csv'} & {one.name for one in out.iterdir()}
+    assert not {'validity.csv', 'consistency.csv', 'calibrations.csv'} & {file.name for file in out.iterdir()}
     # A disk on which the journal finds no room after the first run: what is done is told, and kept as far
     # as there was room.
-    kept = []
+    synced = []
     with monkeypatch.context() as patch:
-        patch.setattr(os, 'fsync', lambda one: full() if len(kept) == 4 else kept.append(one) or fsync(one))
+        patch.setattr(
+            os, 'fsync', lambda file: full() if len(synced) == 4 else synced.append(file) or fsync(file))
         code, output, errors = run(session, *SMALL, '--output', tmp_path / 'other')
     assert code == 2
     assert 'Not complete' in output
@@ -253,7 +254,7 @@ def test_a_journal_that_is_no_file_is_refused_at_once(run, session, tmp_path, ma
     code, output, errors = run(session, *SMALL, '--output', tmp_path / 'out')
     assert (code, output) == (2, '')
     assert 'calibrations.jsonl' in errors.splitlines()[-1]
-    assert [one.name for one in (tmp_path / 'out').iterdir()] == ['calibrations.jsonl']
+    assert [file.name for file in (tmp_path / 'out').iterdir()] == ['calibrations.jsonl']
 
 
 @pytest.mark.parametrize(('workers', 'number'), [
@@ -281,9 +282,9 @@ def test_an_interrupt_keeps_finished_calibrations(session, tmp_path, workers, nu
     (('{session}', '--validate-on', '{session}', '{session}'), '--validate-on: 2 session(s)'),
     (('{session}', '--mass', '-1'), 'parameter mass'),
     (('{session}', '--output', '{session}'), 'choose another place'),
-    (('{session}', '--record'), '--record'),
-], ids=lambda one: one if isinstance(one, str) else None)
-def test_what_cannot_be_used_ends_with_one_line(run, session, words, said):
+    (('{session}', '--pictures'), '--pictures'),
+], ids=lambda words: words if isinstance(words, str) else None)
+def test_unusable_input_ends_with_one_line(run, session, words, said):
     code, output, errors = run(*(word.format(session=session) for word in words))
     assert (code, output) == (2, '')
     assert said in errors.splitlines()[-1]

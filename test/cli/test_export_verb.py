@@ -47,9 +47,9 @@ def test_export_takes_a_form_and_options(export):
 def test_warnings_about_the_exported_dlo_are_printed(export, tmp_path):
     in_millimetres = tmp_path / 'start.csv'
     np.savetxt(in_millimetres, 1000 * read_chain_file(START).points, delimiter=',')
-    code, told, _ = export('--format', 'sdf', start=in_millimetres)
+    code, warnings, _ = export('--format', 'sdf', start=in_millimetres)
     assert code == 0
-    assert 'check that both are the same DLO' in told and 'elasticity is not identifiable' in told
+    assert 'check that both are the same DLO' in warnings and 'elasticity is not identifiable' in warnings
 
 
 @pytest.mark.parametrize('words, said', [

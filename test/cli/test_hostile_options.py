@@ -14,6 +14,7 @@ from toy_simulator import new_toy, ToySimulator
 from dlo_calibration import calibrate
 from dlo_calibration.calibration.options import (
     file_options,
+    FileOptions,
     MACHINE,
     OBSERVATION,
     Options,
@@ -50,13 +51,13 @@ def session_file(folder, options):
 
 def request_file(folder, options):
     trials = tuple(TrialRequest.of(trial) for trial in toy_trials(2))
-    write_request(folder / 'request.xml', Request(trials, {'evaluations': 3, **options}))
+    write_request(folder / 'request.xml', Request(trials, FileOptions({'evaluations': 3, **options})))
     return folder / 'request.xml'
 
 
 def result_file(folder, options):
-    found = calibrate(toy_trials(2), Options(evaluations=3, workers=1), make_simulator=new_toy)
-    write_result(folder / 'result.xml', found, {**Options(evaluations=3).flat(), **options})
+    result = calibrate(toy_trials(2), Options(evaluations=3, workers=1), make_simulator=new_toy)
+    write_result(folder / 'result.xml', result, {**Options(evaluations=3).flat(), **options})
     return folder / 'result.xml'
 
 
@@ -90,7 +91,7 @@ def reached(monkeypatch):
 
 def test_every_option_says_what_it_belongs_to():
     assert {declaration.of for declaration in DECLARED} == {OBSERVATION, SEARCH, MACHINE}
-    assert {one.name for one in DECLARED if one.of == MACHINE} == set(OF_THE_MACHINE)
+    assert {option.name for option in DECLARED if option.of == MACHINE} == set(OF_THE_MACHINE)
     assert inspect.signature(type(DECLARED[0])).parameters['of'].default is inspect.Parameter.empty
 
 
@@ -105,8 +106,8 @@ def test_options_of_the_machine_never_come_from_a_file(write, tmp_path, as_an_at
         lines = [['fit', evil], ['info', evil], ['info', evil, '--json']]
     for line in lines:
         cli.main([str(word) for word in line], reached.make)
-        told = capsys.readouterr()
-        sentence, = [text for text in (told.out + told.err).replace('\n ', ' ').split('\n')
+        printed = capsys.readouterr()
+        sentence, = [text for text in (printed.out + printed.err).replace('\n ', ' ').split('\n')
                      if 'as only the command line or the node may set them' in text]
         if '--json' not in line:
             assert 'workers' in sentence
@@ -120,20 +121,21 @@ def test_options_of_the_machine_never_come_from_a_file(write, tmp_path, as_an_at
 
 @pytest.mark.parametrize('name', OF_THE_MACHINE)
 def test_each_option_of_the_machine_is_left_out_and_named_in_one_line(name):
-    found = file_options({name: OF_THE_MACHINE[name], 'seed': 7}, None)
-    assert dict(found.values) == {'seed': 7}
-    problem, = found.problems
-    assert name in problem
-    assert file_options({name: Options().flat()[name]}, None).problems == ()  # as former versions recorded it
+    given = file_options({name: OF_THE_MACHINE[name], 'seed': 7}, None)
+    assert dict(given.values) == {'seed': 7}
+    warning, = given.warnings
+    assert name in warning
+    assert file_options({name: Options().flat()[name]}, None).warnings == ()  # as former versions recorded it
 
 
 @pytest.mark.parametrize('declaration', [
-    one for one in DECLARED if one.of != MACHINE and one.minimum is not None], ids=lambda one: one.name)
+    option for option in DECLARED if option.of != MACHINE and option.minimum is not None
+], ids=lambda option: option.name)
 def test_the_other_options_are_taken_within_their_ranges(declaration):
     assert dict(file_options({declaration.name: hostile(declaration)}, None).values) == {
         declaration.name: hostile(declaration)}
-    found = file_options({declaration.name: 2 * declaration.maximum + 1}, None)
-    assert dict(found.values) == {} and declaration.name in found.problems[0]
+    given = file_options({declaration.name: 2 * declaration.maximum + 1}, None)
+    assert dict(given.values) == {} and declaration.name in given.warnings[0]
 
 
 def test_the_command_line_chooses_the_machine_whatever_the_file_says(tmp_path, as_an_attacker, reached):
@@ -143,12 +145,12 @@ def test_the_command_line_chooses_the_machine_whatever_the_file_says(tmp_path, a
 
 def test_no_file_of_ours_records_the_machine(tmp_path):
     chosen = {**OF_THE_MACHINE, 'seed': 7}
-    assert read_session(session_file(tmp_path, chosen)).recorded == {'evaluations': 3, 'seed': 7}
+    assert read_session(session_file(tmp_path, chosen)).file_options.values == {'evaluations': 3, 'seed': 7}
     for file in (result_file(tmp_path, chosen), request_file(tmp_path, chosen)):
         text = file.read_text(encoding='utf-8')
         assert 'name="seed"' in text and not any(f'name="{name}"' in text for name in OF_THE_MACHINE)
-    found = read_result(tmp_path / 'result.xml')
-    assert found.problems == (f'do not use this result: {found.unusable}',)  # and nothing about options
+    description = read_result(tmp_path / 'result.xml')  # nothing about options:
+    assert description.file_options.warnings == (f'do not use this result: {description.unusable}',)
 
 
 # ---- scenes
@@ -173,8 +175,8 @@ def test_a_scene_in_the_folder_of_the_file_is_found_from_anywhere(name, tmp_path
 
 def test_a_scene_that_was_elsewhere_is_found_in_the_folder_of_the_file(tmp_path):
     path = scene_in(tmp_path / 'given')
-    found = file_options({'scene': '/home/another/scene.urdf'}, tmp_path / 'given')
-    assert found.values['scene'] == str(path)
+    given = file_options({'scene': '/home/another/scene.urdf'}, tmp_path / 'given')
+    assert given.values['scene'] == str(path)
 
 
 @pytest.mark.parametrize('name', [
@@ -189,12 +191,12 @@ def test_a_file_elsewhere_is_not_taken_as_a_scene(name, tmp_path):
     (folder / 'linked').symlink_to(tmp_path)
     (folder / 'loop').symlink_to('loop')
     os.mkfifo(folder / 'pipe')
-    found = file_options({'scene': str(secret) if name == 'outside' else name}, folder)
-    assert 'scene' not in found.values
-    assert found.problems == (str(found.refusal),)
-    assert len(found.problems[0]) <= 300 and found.problems[0].endswith('or give it with --scene')
+    given = file_options({'scene': str(secret) if name == 'outside' else name}, folder)
+    assert 'scene' not in given.values
+    assert given.warnings == (str(given.refusal),)
+    assert len(given.warnings[0]) <= 500 and given.warnings[0].endswith('or give it with --scene')
     with pytest.raises(InputError):
-        found.options()
+        given.options()
 
 
 @pytest.mark.parametrize('write', [session_file, request_file, result_file])
@@ -226,7 +228,7 @@ def test_a_library_user_is_refused_too(tmp_path):
 def test_a_session_in_one_file_finds_its_scene_beside_it(tmp_path):
     folder = session_file(tmp_path, {'scene': 'scene.urdf'})
     file = next(folder.glob('*.mcap')).rename(tmp_path / 'alone.mcap')
-    assert read_session(file).refusal is not None
-    assert read_session(file).recorded == {'evaluations': 3}
+    assert read_session(file).file_options.refusal is not None
+    assert read_session(file).file_options.values == {'evaluations': 3}
     path = scene_in(tmp_path)
     assert read_session(file).options.scene == str(path)

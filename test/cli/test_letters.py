@@ -35,8 +35,8 @@ def whole_chain(points, dlo):
     return chain.resample(np.linspace(0, chain.length, POINTS))
 
 
-def away(one, other):
-    return float(np.linalg.norm(one - other, axis=1).mean())
+def away(points, goal):
+    return float(np.linalg.norm(points - goal, axis=1).mean())
 
 
 def test_ropes_hold_the_letters_for_which_the_strokes_are_too_sharp(examples):
@@ -44,7 +44,7 @@ def test_ropes_hold_the_letters_for_which_the_strokes_are_too_sharp(examples):
     with_true = make_simulator(Options()).refined()
     sprung = []
     for name, corners in letters.LETTERS.values():
-        dlo, = (one for one in KNOWN_DLOS if one.name == name)
+        dlo, = (dlo for dlo in KNOWN_DLOS if dlo.name == name)
         stroke = letters.stroke(corners, dlo.length)
         held = letters.held(stroke, Belief.certain(TRUE, dlo))
         assert away(held, stroke) < 0.01 * dlo.length  # it still is that letter
@@ -60,14 +60,14 @@ def test_the_picture_and_the_film_show_all_ropes(examples, tmp_path, monkeypatch
         monkeypatch.setattr(drawing, name, fewer)
     start = np.column_stack([np.linspace(0, 0.6, 21), np.zeros(21), np.full(21, 0.004)])
     chains = np.stack([start, start + (0, 0.05, 0), start + (0, 0.1, 0)])
-    actions = tuple(GraspAndPlace(start=0.0, point=0, to=(0, 0.1, 0.004)).action(Chain(one))
-                    for one in chains[:-1])
-    found = []
+    actions = tuple(GraspAndPlace(start=0.0, point=0, to=(0, 0.1, 0.004)).action(Chain(points))
+                    for points in chains[:-1])
+    frames = []
     for letter, dlo, count in zip('DLO', KNOWN_DLOS, (2, 1, 2), strict=False):  # one is laid earlier
-        found.append(letters.Laid(letter, dlo, chains[-1], chains[:count + 1], (17.0, 8.0, 0.5)[:count + 1],
+        frames.append(letters.Laid(letter, dlo, chains[-1], chains[:count + 1], (17.0, 8.0, 0.5)[:count + 1],
                                   actions[:count], (chains[[0] * 30], chains[[1] * 30])[:count]))
-    drawing.draw_letters(found, tmp_path / 'letters.png')
-    drawing.draw_film(found, tmp_path / 'letters.gif')
+    drawing.draw_letters(frames, tmp_path / 'letters.png')
+    drawing.draw_film(frames, tmp_path / 'letters.gif')
     with Image.open(tmp_path / 'letters.png') as picture, Image.open(tmp_path / 'letters.gif') as film:
         assert film.n_frames > 4
         for image in (picture, film):

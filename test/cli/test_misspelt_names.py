@@ -3,6 +3,7 @@
 
 """A misspelt name is answered with the one that was probably meant, wherever names are read."""
 
+import argparse
 from pathlib import Path
 
 import pytest
@@ -68,3 +69,18 @@ def test_a_known_name_in_the_wrong_place_gets_no_suggestion():
 def test_a_misspelt_name_in_the_library_gets_a_suggestion(make, meant):
     with pytest.raises(InputError, match=rf'did you mean {meant}\?'):
         make()
+
+
+@pytest.mark.parametrize('verb', ['fit', 'validate', 'simulate', 'plan', 'plot', 'experiment', 'export',
+                                  'capture'])
+def test_each_parameter_of_the_node_is_a_flag_of_each_verb_that_simulates(verb):
+    parser = argparse.ArgumentParser()
+    cli.module_of(verb).add_arguments(parser)
+    assert {f'--{name.replace("_", "-")}' for name in Options().flat()} <= {*parser._option_string_actions}
+
+
+def test_simulate_takes_workers_and_says_which_flags_change_nothing(tmp_path, capsys):
+    words = ['simulate', str(SAMPLES / 'xml/dlo.xml'), str(SAMPLES / 'xml/hand_paths.xml'), '--draws', '0']
+    assert cli.main([*words, '--workers', '1', '--mass', '0.3']) == 0
+    errors = capsys.readouterr().err
+    assert '--mass: has no effect on simulate' in errors and '--workers' not in errors

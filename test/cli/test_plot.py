@@ -62,13 +62,13 @@ def test_result_is_drawn_too(run, session, result, tmp_path):
     assert code == 0
     assert json.loads(output) == {
         'pictures': [str(tmp_path / 'both' / f'trial_{k}.png') for k in (1, 2)], 'animations': []}
-    one, two = (np.asarray(Image.open(tmp_path / name / 'trial_1.png').convert('RGB')).astype(int)
-                for name in ('measured', 'both'))
+    measured, both = (np.asarray(Image.open(tmp_path / name / 'trial_1.png').convert('RGB')).astype(int)
+                      for name in ('measured', 'both'))
 
     def simulated(image):
         return (np.abs(image - ImageColor.getrgb(SIMULATED)).sum(axis=2) < 30).sum()
 
-    assert simulated(one) == 0 < simulated(two)
+    assert simulated(measured) == 0 < simulated(both)
 
 
 def test_animation_is_a_gif_per_trial(run, session, result, tmp_path, monkeypatch):
@@ -108,7 +108,7 @@ def test_pictures_go_to_the_working_directory_by_default(run, session, tmp_path,
     (['--output', '{session}'], 'choose another place'),
     (['{session}'], 'recorded.mcap'),
 ], ids=['animation of nothing', 'folder that is a file', 'result that is none'])
-def test_what_cannot_be_used_ends_with_one_line(run, session, words, said):
+def test_unusable_input_ends_with_one_line(run, session, words, said):
     code, output, errors = run('plot', session, *(word.format(session=session) for word in words))
     assert (code, output, errors.count('\n')) == (2, '', 1)
     assert said in errors

@@ -103,10 +103,10 @@ def test_a_killed_fit_goes_on_to_the_same_files(session, tmp_path, act):
     assert errors == said
     code, output, errors, toy = act('fit', '--resume', out, '--json')
     assert (code, errors, toy.count) == (0, said, 2)  # the trials once, and no search
-    found, file = json.loads(output), read_result(out / RESULT)
-    assert {name: one['value'] for name, one in found['parameters'].items()} == file.values
-    assert (found['score'], found['evaluations'], found['seconds']) == (file.score, 25, file.seconds)
-    assert (found['stop_reason'], found['warnings']) == (file.stop_reason, list(file.warnings))
+    files, file = json.loads(output), read_result(out / RESULT)
+    assert {name: estimate['value'] for name, estimate in files['parameters'].items()} == file.values
+    assert (files['score'], files['evaluations'], files['seconds']) == (file.score, 25, file.seconds)
+    assert (files['stop_reason'], files['warnings']) == (file.stop_reason, list(file.warnings))
 
 
 def test_the_same_command_goes_on_and_another_calibration_is_not_lost(session, tmp_path, act, abandon):
@@ -212,7 +212,7 @@ def test_a_request_is_resumed_from_its_copy(tmp_path, act, abandon):
     assert names(out) == FINISHED | {REQUEST}
 
 
-def test_what_cannot_be_simulated_leaves_nothing_to_resume(session, tmp_path, act):
+def test_a_failed_simulation_leaves_nothing_to_resume(session, tmp_path, act):
     toy = CountingToy()
     toy.fail_below = 101.0
     code, _, errors, _ = act('fit', session, '--output', tmp_path / 'out', *FLAGS, toy=toy)

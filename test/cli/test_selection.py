@@ -63,7 +63,8 @@ def act(capsys):
 
 def numbers(act, *words):
     """Return the numbers and names of the trials that `info` shows."""
-    return [(one['number'], one['name']) for one in json.loads(act('info', *words, '--json')[1])['trials']]
+    printed = json.loads(act('info', *words, '--json')[1])
+    return [(trial['number'], trial['name']) for trial in printed['trials']]
 
 
 def test_every_verb_leaves_trials_out_and_keeps_the_numbers_of_the_others(session, tmp_path, act):
@@ -76,12 +77,12 @@ def test_every_verb_leaves_trials_out_and_keeps_the_numbers_of_the_others(sessio
     result = tmp_path / 'out' / 'result.xml'
     assert read_result(result).trials == ('trial 1', 'trial 3')
     scores = json.loads(act('validate', result, session, '--json')[1])['scores']
-    kept = json.loads(act('validate', result, session, '--without', '1', '--json')[1])['scores']
-    assert kept == scores[1:]
+    remaining = json.loads(act('validate', result, session, '--without', '1', '--json')[1])['scores']
+    assert remaining == scores[1:]
     act('plot', session, '--without', '2', '--output', tmp_path / 'drawn')
-    assert {one.name for one in (tmp_path / 'drawn').iterdir()} == {'trial_1.png', 'trial_3.png'}
+    assert {file.name for file in (tmp_path / 'drawn').iterdir()} == {'trial_1.png', 'trial_3.png'}
     moved = json.loads(act('simulate', result, session, '--without', '1,2', '--draws', '0', '--json')[1])
-    assert {one['trial'] for one in moved['actions']} == {'trial 3'}
+    assert {action['trial'] for action in moved['actions']} == {'trial 3'}
 
 
 def repeated(act, folder):
@@ -96,9 +97,9 @@ def repeated(act, folder):
 def request(path):
     """Write the toy trials as a request; return its path."""
     write_request(path, Request(tuple(
-        TrialRequest(one.name, one.initial, one.actions,
-                     tuple(GoalRequest(goal.chain, goal.time) for goal in one.goals))
-        for one in toy_trials(3))))
+        TrialRequest(trial.name, trial.initial, trial.actions,
+                     tuple(GoalRequest(goal.chain, goal.time) for goal in trial.goals))
+        for trial in toy_trials(3))))
     return path
 
 
@@ -123,14 +124,15 @@ def test_an_interrupted_fit_goes_on_with_the_same_trials(source, session, own, t
     assert read_result(out / 'result.xml').values == read_result(whole).values
     again = json.loads(act('fit', '--resume', out, '--json')[1])
     assert (again['trials'], again['score']) == (2, pytest.approx(read_result(whole).score))
-    assert {name: one['value'] for name, one in repeated(act, out).items()} == read_result(whole).values
+    values = {name: estimate['value'] for name, estimate in repeated(act, out).items()}
+    assert values == read_result(whole).values
 
 
 def test_topics_with_other_names_are_read_and_written_with_ours(session, own, tmp_path, act):
     assert numbers(act, own, *REMAP) == numbers(act, session)
     expected = json.loads(act('fit', session, *FEW, '--json')[1])['parameters']
-    found = json.loads(act('fit', own, *FEW, *REMAP, '--output', tmp_path, '--json')[1])['parameters']
-    assert found == expected
+    printed = json.loads(act('fit', own, *FEW, *REMAP, '--output', tmp_path, '--json')[1])['parameters']
+    assert printed == expected
     assert len(read_session(tmp_path / 'session.mcap').trials) == 3
     assert json.loads(act('validate', tmp_path / 'result.xml', own, *REMAP, '--json')[1])['trials'] == 3
 
@@ -141,17 +143,17 @@ def test_a_remapped_topic_is_read_instead_of_one_of_that_name(tmp_path, act):
     wrong = {**names, INITIAL: '/calibrator/goal_chain', GOAL: '/tracker'}  # goals are elsewhere
     other = recorded(tmp_path / 'other', wrong, 1)
     words = ('--remap', '/tracker:=goal_chain', '--remap', 'calibrator/goal_chain:=~/initial_chain')
-    one, two = (json.loads(act('info', *words, '--json')[1])['trials'][0]
-                for words in ((path,), (other, *words)))
-    assert one == two
+    remapped, named = (json.loads(act('info', *words, '--json')[1])['trials'][0]
+                       for words in ((path,), (other, *words)))
+    assert remapped == named
 
 
 def test_info_names_the_topics_that_it_does_not_know_and_how_to_use_them(own, act):
     code, output, errors = act('info', own, '--json')
-    found = json.loads(output)
-    assert (code, errors, found['trials']) == (0, '', [])
-    unknown = {one['topic']: one for one in found['unknown_topics']}
-    assert {topic: (one['type'], one['messages']) for topic, one in unknown.items()} == {
+    printed = json.loads(output)
+    assert (code, errors, printed['trials']) == (0, '', [])
+    unknown = {entry['topic']: entry for entry in printed['unknown_topics']}
+    assert {topic: (entry['type'], entry['messages']) for topic, entry in unknown.items()} == {
         '/chatter': ('std_msgs/msg/String', 1), **{
             topic: (INPUT_TYPES[kind], 3) for kind, topic in OWN.items()}}
     assert unknown['/chatter']['hint'] == ''

@@ -70,14 +70,14 @@ def test_each_action_is_described_in_a_sentence(run, request_of):
 def test_json_has_the_actions_of_all_trials(run, request_of):
     trials = [PLACE], [Drag(point=10, direction=(0, 1, 0), distance=0.1)]
     code, output, _ = run(RESULT, request_of(*trials), '--json', '--draws', 2, '--seed', 3)
-    found = json.loads(output)
+    printed = json.loads(output)
     assert code == 0
-    assert {key: found[key] for key in ('draws', 'seed', 'engine', 'remarks')} == {
+    assert {key: printed[key] for key in ('draws', 'seed', 'engine', 'remarks')} == {
         'draws': 2, 'seed': 3, 'engine': 'compiled', 'remarks': []}
-    assert [(one['trial'], one['name']) for one in found['actions']] == [
+    assert [(action['trial'], action['name']) for action in printed['actions']] == [
         ('one', 'grasp_and_place'), ('one', 'drag')]
-    lower, upper = np.array(found['actions'][1]['predicted_lower_upper_m'])
-    predicted = np.array(found['actions'][1]['predicted'])
+    lower, upper = np.array(printed['actions'][1]['predicted_lower_upper_m'])
+    predicted = np.array(printed['actions'][1]['predicted'])
     assert predicted.shape == (21, 3) and (lower <= predicted).all() and (predicted <= upper).all()
     assert predicted[10, 1] == pytest.approx(0.1, abs=0.01)
 
@@ -104,17 +104,17 @@ def test_folder_gets_pictures_animations_and_chains(run, request_of, tmp_path, m
 
 def test_a_recorded_session_is_simulated_where_its_hands_were(run):
     code, output, _ = run(RESULT, SAMPLES / 'object1', '--json', '--draws', 0)
-    found = json.loads(output)['actions']
+    printed = json.loads(output)['actions']
     assert code == 0
-    assert [one['trial'] for one in found] == [f'trial {k}' for k in range(1, 5)]
-    assert [one['held_by'] for one in found] == [[], [], ['left_hand'], ['left_hand', 'right_hand']]
+    assert [trial['trial'] for trial in printed] == [f'trial {k}' for k in range(1, 5)]
+    assert [trial['held_by'] for trial in printed] == [[], [], ['left_hand'], ['left_hand', 'right_hand']]
 
 
 @pytest.mark.parametrize(('words', 'what'), [
     (['--draws', '-1'], '--draws: -1; expected 0 to 10000'),
     (['--seed', '-1'], '--seed: -1'),
     (['--nodes', '1'], 'nodes: 1'),
-    (['--evaluations', '5'], 'unrecognized arguments: --evaluations'),
+    (['--pictures', '5'], 'unrecognized arguments: --pictures'),
 ])
 def test_bad_flags_are_refused_in_one_line(run, request_of, words, what):
     code, output, notes = run(RESULT, request_of([PLACE]), *words)
@@ -154,8 +154,8 @@ def test_a_chain_of_another_length_gives_a_warning(run, request_of):
 
 def test_more_points_than_a_dlo_has_are_refused(run, request_of):
     path = request_of([PLACE], start=straight(1000))
-    one = re.search('<point [^>]*/>', path.read_text())[0]
-    path.write_text(path.read_text().replace(one, f'{one}{one}', 1))
+    point = re.search('<point [^>]*/>', path.read_text())[0]
+    path.write_text(path.read_text().replace(point, f'{point}{point}', 1))
     code, output, notes = run(RESULT, path)
     assert (code, output) == (2, '') and '1001 points; expected at most 1000; leave some' in notes
 

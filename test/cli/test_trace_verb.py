@@ -42,29 +42,29 @@ def traced(capsys, *args):
 
 def test_clicks_and_known_points_give_the_chain(photograph, capsys, tmp_path):
     files = ['--output', str(tmp_path / 'chain.csv'), '--picture', str(tmp_path / 'picture.png')]
-    found = traced(capsys, photograph, '--points', words(CLICKS), '--scale', KNOWN, '--diameter', '0.008',
+    printed = traced(capsys, photograph, '--points', words(CLICKS), '--scale', KNOWN, '--diameter', '0.008',
                    *files)
     along = np.linspace(0, len(POINTS) - 1, 21).round().astype(int)
-    np.testing.assert_allclose(found['points'], POINTS[along], atol=3e-3)  # a pixel is 0.9 mm
-    assert found['length_m'] == pytest.approx(0.5, abs=5e-3)
-    assert found['width_px'] == pytest.approx(9, abs=3)
-    assert found['crossings'] == []
-    steps = np.linalg.norm(np.diff(found['pixels'], axis=0), axis=1)
+    np.testing.assert_allclose(printed['points'], POINTS[along], atol=3e-3)  # a pixel is 0.9 mm
+    assert printed['length_m'] == pytest.approx(0.5, abs=5e-3)
+    assert printed['width_px'] == pytest.approx(9, abs=3)
+    assert printed['crossings'] == []
+    steps = np.linalg.norm(np.diff(printed['pixels'], axis=0), axis=1)
     assert steps.max() < 5
-    np.testing.assert_allclose(found['pixels'][0], SCALE.to_pixels(POINTS[:1])[0], atol=4)
-    np.testing.assert_array_equal(read_chain_file(tmp_path / 'chain.csv').points, found['points'])
+    np.testing.assert_allclose(printed['pixels'][0], SCALE.to_pixels(POINTS[:1])[0], atol=4)
+    np.testing.assert_array_equal(read_chain_file(tmp_path / 'chain.csv').points, printed['points'])
     with Image.open(tmp_path / 'picture.png') as picture:
         changed = np.asarray(picture).astype(int) - np.asarray(Image.open(photograph))
-    u, v = np.rint(found['pixels'][len(found['pixels']) // 3]).astype(int)
+    u, v = np.rint(printed['pixels'][len(printed['pixels']) // 3]).astype(int)
     assert np.abs(changed[v, u]).max() > 50
 
 
 def test_without_a_scale_there_is_only_the_line(photograph, capsys):
-    found = traced(capsys, photograph, '--points', words(CLICKS[::-1]))
+    printed = traced(capsys, photograph, '--points', words(CLICKS[::-1]))
     document = (Path(__file__).parents[2] / 'doc/messages.md').read_text(encoding='utf-8')
-    assert [key for key in found if f'`{key}`' not in document] == []
-    assert found['points'] is found['length_m'] is None
-    np.testing.assert_allclose(found['pixels'][-1], SCALE.to_pixels(POINTS[:1])[0], atol=4)
+    assert [key for key in printed if f'`{key}`' not in document] == []
+    assert printed['points'] is printed['length_m'] is None
+    np.testing.assert_allclose(printed['pixels'][-1], SCALE.to_pixels(POINTS[:1])[0], atol=4)
 
 
 def test_people_read_the_length(photograph, capsys, tmp_path):
@@ -94,7 +94,7 @@ BOTH_ENDS = words(CLICKS[[0, -1]])
     (['--points', BOTH_ENDS, '--diameter', '-1'], '--diameter'),
     (['--points', BOTH_ENDS, '--output', 'chain.csv'], '--output'),
 ])
-def test_what_cannot_be_used_gets_one_sentence(photograph, args, text, capsys):
+def test_unusable_input_is_refused_in_one_sentence(photograph, args, text, capsys):
     assert main(['trace', photograph, *args]) == 2
     out, err = capsys.readouterr()
     assert out == ''

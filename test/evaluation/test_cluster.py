@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A real Dask scheduler with real workers, over TCP on this machine: the same result, whoever dies."""
+"""A real Dask scheduler with real workers, over TCP on this machine: the same result if workers die."""
 
 from concurrent.futures import Future
 from contextlib import contextmanager
@@ -32,7 +32,7 @@ PATHS = os.pathsep.join([str(ROOT), str(ROOT / 'test/support'), os.environ.get('
 
 def dask(part, *words, **environment):
     """Start a part of a cluster as a process of its own."""
-    # What a dead worker had found is asked of it for 30 s, unless Dask is told otherwise.
+    # By default, Dask tries for 30 s to get the results of a dead worker.
     environment = {'DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT': '5s', **environment}
     return subprocess.Popen(
         [sys.executable, '-m', f'distributed.cli.dask_{part}', '--host', '127.0.0.1', '--no-dashboard',
@@ -113,21 +113,22 @@ def same(first, second):
 def test_a_killed_worker_gives_a_warning_and_the_result_of_one_process(machines, capfd):
     address, processes = machines
     alone = calibrate(toy_trials(2), options(), make_simulator=new_toy)
-    told = []
-    whole = calibrate(toy_trials(2), options(address), make_simulator=new_toy, on_notice=told.append)
+    notices = []
+    whole = calibrate(toy_trials(2), options(address), make_simulator=new_toy, on_notice=notices.append)
     same(alone, whole)
-    assert told == []
+    assert notices == []
 
     def kill(evaluation):
         if evaluation.index == 10:
             os.kill(processes[1].pid, signal.SIGKILL)
 
     torn = calibrate(toy_trials(2), options(address),
-                     make_simulator=lambda _: ToySimulator(0.005), on_evaluation=kill, on_notice=told.append)
+                     make_simulator=lambda _: ToySimulator(0.005), on_evaluation=kill,
+                     on_notice=notices.append)
     same(alone, torn)
-    assert len(told) == 1
-    assert 'the scheduler lost the worker tcp://127.0.0.1:' in told[0]
-    assert torn.warnings == tuple(told)
+    assert len(notices) == 1
+    assert 'the scheduler lost the worker tcp://127.0.0.1:' in notices[0]
+    assert torn.warnings == tuple(notices)
     assert capfd.readouterr() == ('', '')
 
 
@@ -147,11 +148,11 @@ def test_a_stop_leaves_nothing_at_the_scheduler(machines):
 
 
 def test_without_workers_it_says_so_and_waits(scheduler):
-    told = []
+    notices = []
     with pytest.raises(DloCalibrationError, match='stopped before the'):
         calibrate(toy_trials(1), options(scheduler),
-                  make_simulator=new_toy, should_stop=lambda: bool(told), on_notice=told.append)
-    assert 'has no workers yet' in told[0]
+                  make_simulator=new_toy, should_stop=lambda: bool(notices), on_notice=notices.append)
+    assert 'has no workers yet' in notices[0]
 
 
 def test_a_machine_without_a_module_or_with_another_version_is_refused(scheduler, start_worker, tmp_path):
@@ -165,27 +166,27 @@ def test_a_machine_without_a_module_or_with_another_version_is_refused(scheduler
         worker.wait()
 
 
-def test_an_evaluation_that_kills_as_many_workers_as_allowed_ends_with_what_to_do(tmp_path):
+def test_an_evaluation_that_kills_too_many_workers_ends_with_what_to_do(tmp_path):
     with running(tmp_path, 1, DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES='0') as (address, _):
         with pytest.raises(DloCalibrationError, match='1 workers of the scheduler .* give them more memory'):
             calibrate(toy_trials(1), options(address), make_simulator=lambda _: Deadly())
 
 
 @pytest.mark.long
-def test_the_last_worker_has_a_while_to_come_back(scheduler, start_worker, monkeypatch):
+def test_a_calibration_ends_if_no_worker_returns_in_time(scheduler, start_worker, monkeypatch):
     monkeypatch.setattr(cluster, 'RETURN', 1.0)
-    told = []
+    notices = []
     start_worker()
     wait_for_workers(scheduler, 1)
     with pytest.raises(DloCalibrationError, match='lost its last worker, and none came back within 1 s'):
         calibrate(toy_trials(1), options(scheduler),
-                  make_simulator=lambda _: Deadly(), on_notice=told.append)
-    assert len(told) == 1
-    assert 'the scheduler lost the worker' in told[0]
+                  make_simulator=lambda _: Deadly(), on_notice=notices.append)
+    assert len(notices) == 1
+    assert 'the scheduler lost the worker' in notices[0]
 
 
 @pytest.mark.long
-def test_a_worker_that_comes_back_goes_on(scheduler, start_worker, monkeypatch):
+def test_a_calibration_goes_on_when_a_worker_returns(scheduler, start_worker, monkeypatch):
     monkeypatch.setattr(cluster, 'RETURN', PATIENCE)
     first = start_worker()
 
@@ -199,7 +200,7 @@ def test_a_worker_that_comes_back_goes_on(scheduler, start_worker, monkeypatch):
     same(torn, calibrate(toy_trials(2), options(), make_simulator=new_toy))
 
 
-def test_a_scheduler_that_hangs_holds_nobody_up_and_one_that_is_killed_ends_it(tmp_path, capfd):
+def test_a_hanging_scheduler_does_not_delay_the_end_and_a_killed_one_ends_the_calibration(tmp_path, capfd):
     def search(address, **rest):
         return calibrate(toy_trials(1), options(address, evaluations=10000),
                          make_simulator=lambda _: ToySimulator(0.01), **rest)
@@ -220,16 +221,16 @@ def test_a_scheduler_that_hangs_holds_nobody_up_and_one_that_is_killed_ends_it(t
 
 
 @pytest.mark.parametrize('address', ['nonsense', 'tcp://', 'tcp://127.0.0.1'])
-def test_an_address_that_is_none_is_refused(address):
+def test_an_invalid_address_is_refused(address):
     with pytest.raises(InputError, match='parameter scheduler: .* start one with: dask scheduler'):
         calibrate(toy_trials(1), options(address), make_simulator=new_toy)
 
 
 def test_a_scheduler_that_does_not_answer_is_refused():
-    with socket.socket() as taken:
-        taken.bind(('127.0.0.1', 0))  # and does not listen
+    with socket.socket() as server:
+        server.bind(('127.0.0.1', 0))  # and does not listen
         with pytest.raises(InputError, match='such as tcp://host:8786'):
-            cluster.ClusterExecutor(f'tcp://127.0.0.1:{taken.getsockname()[1]}')
+            cluster.ClusterExecutor(f'tcp://127.0.0.1:{server.getsockname()[1]}')
 
 
 def test_without_the_library_it_says_how_to_install_it(monkeypatch):
@@ -238,8 +239,8 @@ def test_without_the_library_it_says_how_to_install_it(monkeypatch):
         calibrate(toy_trials(1), options('tcp://127.0.0.1:1'), make_simulator=new_toy)
 
 
-def test_a_result_that_dask_takes_for_an_error_is_asked_for_again():
-    """A worker may be lost after its result has arrived, and before Dask has looked at its status."""
+def test_a_call_whose_result_dask_misreads_as_an_error_is_sent_again():
+    """A worker may be lost after its result has arrived, and before Dask has read its status."""
     from distributed.cfexecutor import _cascade_future
     from tornado.ioloop import IOLoop
 
@@ -263,7 +264,7 @@ def test_a_result_that_dask_takes_for_an_error_is_asked_for_again():
 
     executor = object.__new__(cluster.ClusterExecutor)
     executor._executor, executor._pending, executor._given_up = Scheduler(), {}, None
-    executor._kept = {}
+    executor._pickled = {}
     executor._closed = threading.Event()
     assert executor.submit(pow, 2, 3).result(timeout=5) == 8
     assert executor._executor.asked == 2

@@ -33,7 +33,7 @@ def test_a_difference_uses_the_outermost_values_that_could_be_simulated():
     assert sides.jacobian(before, [None, high], here) == pytest.approx(np.array([[30]]))
 
 
-def test_a_column_without_two_values_stays():
+def test_a_column_without_two_values_is_unchanged():
     sides = Differences.central(np.array([0.5, 1.0]), [0], np.array([0.1, 0.1]))
     before = np.array([[7.0, 8.0]])
     assert np.array_equal(sides.jacobian(before, [None, np.zeros(1)]), before)
@@ -56,19 +56,19 @@ def test_the_step_leads_to_the_lowest_sum_of_squares():
     assert FIT.columns(np.array([0, 2])).weighted(np.ones(30)).step().shape == (2,)
 
 
-def test_a_parameter_without_effect_stays():
+def test_a_parameter_without_effect_keeps_its_value():
     flat = JACOBIAN * [1.0, 0.0, 1.0]
     fit = Linearisation(FIT.point, flat @ AWAY, flat)
     assert fit.step(fit.ridge) == pytest.approx([-0.1, 0, -0.05], abs=1e-6)
 
 
-def test_a_change_tells_of_one_parameter_how_far_it_moved():
+def test_own_weights_give_the_change_of_a_single_parameter():
     assert [float(FIT.own_weights(k) @ (JACOBIAN @ AWAY)) for k in range(3)] == pytest.approx(AWAY)
 
 
-def test_more_error_leaves_larger_standard_deviations():
-    one, two = (standard_deviations(information(JACOBIAN, scale)) for scale in (1e-3, 2e-3))
-    assert two == pytest.approx(2 * one)
-    errors = np.random.default_rng(2).normal(0, 1e-3, (4000, 30))
-    found = np.linalg.lstsq(JACOBIAN, errors.T, rcond=None)[0]
-    assert found.std(axis=1) == pytest.approx(one, rel=0.05)
+def test_standard_deviations_are_those_of_fits_to_noise():
+    small, large = (standard_deviations(information(JACOBIAN, scale)) for scale in (1e-3, 2e-3))
+    assert large == pytest.approx(2 * small)
+    noise = np.random.default_rng(2).normal(0, 1e-3, (4000, 30))
+    fits = np.linalg.lstsq(JACOBIAN, noise.T, rcond=None)[0]
+    assert fits.std(axis=1) == pytest.approx(small, rel=0.05)

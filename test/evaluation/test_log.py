@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The log of evaluations: what survives, and what a damaged or a stranger's one does."""
+"""The log of evaluations: it survives kills, and a damaged or a stranger's log does no harm."""
 
 from dataclasses import replace
 import os
@@ -44,56 +44,57 @@ def remembered(path, evaluator, points=POINTS):
 
 def write(path, evaluator, points=POINTS):
     """Write the evaluations of points to a log; return them."""
-    found = [evaluator.evaluate(k, point) for k, point in enumerate(points)]
+    evaluations = [evaluator.evaluate(k, point) for k, point in enumerate(points)]
     with EvaluationLog(path) as log:
-        for one in found:
-            Memory(log).of(evaluator).add(one)
-    return found
+        for evaluation in evaluations:
+            Memory(log).of(evaluator).add(evaluation)
+    return evaluations
 
 
-def same(one, other):
-    """Tell whether two evaluations are equal, bit for bit."""
-    return repr(one) == repr(other) and (
-        one.residuals is other.residuals is None or one.residuals.tobytes() == other.residuals.tobytes())
+def same(first, second):
+    """Return whether two evaluations are equal, bit for bit."""
+    return repr(first) == repr(second) and (
+        first.residuals is second.residuals is None
+        or first.residuals.tobytes() == second.residuals.tobytes())
 
 
-def test_evaluations_come_back_bit_for_bit_failed_ones_too(path, evaluator):
-    found = write(path, evaluator)
-    assert {bool(one.failure) for one in found} == {True, False}
-    assert all(map(same, remembered(path, evaluator), found))
+def test_evaluations_also_failed_ones_are_read_back_bit_for_bit(path, evaluator):
+    evaluations = write(path, evaluator)
+    assert {bool(evaluation.failure) for evaluation in evaluations} == {True, False}
+    assert all(map(same, remembered(path, evaluator), evaluations))
 
 
-def test_an_evaluation_of_a_stream_comes_back_with_the_errors_of_every_goal(path):
+def test_an_evaluation_of_a_stream_is_read_back_with_the_errors_of_every_goal(path):
     trial, = toy_trials(1)
     goals = [replace(trial.goals[0], time=2 + k / 100, stable=False) for k in range(100)]
     streamed = replace(trial, goals=tuple(goals))
     evaluator = Evaluator([streamed], ParameterSpace(), ToySimulator(), every_goal=False)
-    found = write(path, evaluator)
-    assert all(map(same, remembered(path, evaluator), found))
+    evaluations = write(path, evaluator)
+    assert all(map(same, remembered(path, evaluator), evaluations))
     every = Evaluator([streamed], ParameterSpace(), ToySimulator())
     assert remembered(path, every) == [None] * 5  # its residuals are others
 
 
-def test_another_trial_space_engine_or_point_is_not_in_it(path, evaluator):
+def test_evaluations_of_another_trial_space_engine_or_point_are_not_found(path, evaluator):
     write(path, evaluator)
     others = [Evaluator(toy_trials(3)[1:], evaluator.space, evaluator.simulator),
               Evaluator(evaluator.trials, ParameterSpace(mass=0.1), evaluator.simulator)]
-    assert [one for other in others for one in remembered(path, other) if one] == []
+    assert not any(evaluation for other in others for evaluation in remembered(path, other))
     with EvaluationLog(path) as log:
         assert Memory(log, 'other settings').of(evaluator).find(0, POINTS[0]) is None
         assert Memory(log).of(evaluator, finer=True).find(0, POINTS[0]) is None
 
 
 def test_a_damaged_byte_costs_one_evaluation_and_a_cut_the_last(path, evaluator):
-    found = write(path, evaluator)
+    evaluations = write(path, evaluator)
     whole = path.read_bytes()
     for place in np.linspace(0, len(whole) - 1, 60).astype(int):
         damaged = bytearray(whole)
         damaged[place] ^= 4
         path.write_bytes(damaged)
-        left = remembered(path, evaluator)
-        assert sum(one is None for one in left) in (1, 2)  # two where the end of a line was hit
-        assert all(same(*pair) for pair in zip(left, found, strict=True) if pair[0])
+        intact = remembered(path, evaluator)
+        assert intact.count(None) in (1, 2)  # two if the end of a line was damaged
+        assert all(same(*pair) for pair in zip(intact, evaluations, strict=True) if pair[0])
         path.write_bytes(whole[:place])
         assert sum(map(bool, remembered(path, evaluator))) == whole[:place].count(b'\n')
 
@@ -102,11 +103,11 @@ def test_a_cut_log_is_continued(path, evaluator):
     write(path, evaluator)
     path.write_bytes(path.read_bytes()[:-9])
     assert remembered(path, evaluator)[4] is None
-    found = write(path, evaluator)
-    assert all(map(same, remembered(path, evaluator), found))
+    evaluations = write(path, evaluator)
+    assert all(map(same, remembered(path, evaluator), evaluations))
 
 
-def test_what_no_evaluator_can_have_written_is_simulated_again(path, evaluator):
+def test_entries_that_no_evaluator_can_have_written_are_ignored(path, evaluator):
     """A stranger can compute check sums, too."""
     write(path, evaluator)
     keys = [line.split()[0].decode() for line in path.read_bytes().splitlines()]
@@ -133,20 +134,20 @@ def test_a_log_that_is_no_regular_file_is_refused_at_once(path, make):
 
 
 def test_a_full_disk_gives_one_warning_and_the_log_written_so_far_stays(path, evaluator, monkeypatch):
-    told = []
+    warnings = []
     with EvaluationLog(path) as log:
-        memory = Memory(log, '', told.append).of(evaluator)
-        found = [evaluator.evaluate(k, point) for k, point in enumerate(POINTS)]
-        memory.add(found[0])
+        memory = Memory(log, '', warnings.append).of(evaluator)
+        evaluations = [evaluator.evaluate(k, point) for k, point in enumerate(POINTS)]
+        memory.add(evaluations[0])
         real = os.write
         monkeypatch.setattr(os, 'write', lambda file, octets: real(file, octets[:40]) if len(octets) > 40
                             else (_ for _ in ()).throw(OSError(28, 'No space left on device')))
-        for one in found[1:]:
-            memory.add(one)
+        for evaluation in evaluations[1:]:
+            memory.add(evaluation)
         monkeypatch.undo()
-        assert same(memory.find(0, POINTS[0]), found[0])
+        assert same(memory.find(0, POINTS[0]), evaluations[0])
         assert memory.find(1, POINTS[1]) is None
-    text, = told
+    text, = warnings
     assert 'No space left on device; the calibration goes on' in text
     assert sum(map(bool, remembered(path, evaluator))) == 1
 
@@ -159,12 +160,12 @@ def test_digest_is_the_same_in_another_process(tmp_path):
     assert done.stdout.strip() == digest(toy_trials(2), {'a': None, 'b': 1.5})
 
 
-def test_digest_tells_things_apart():
+def test_different_values_have_different_digests():
     array = np.arange(6.0)
-    things = [1, 1.0, True, '1', b'1', (1,), ((1,),), (1, 1), ('1', 1), None, 'None', {}, (), {'1': 1}, array,
+    values = [1, 1.0, True, '1', b'1', (1,), ((1,),), (1, 1), ('1', 1), None, 'None', {}, (), {'1': 1}, array,
               array[:5], array.reshape(2, 3), array.astype('f4'), toy_trial(TRUTH), toy_trial(TRUTH, 'other'),
               toy_trial({**TRUTH, 'friction': 70.1}), 0.0, -0.0]
-    assert len({digest(one) for one in things}) == len(things)
+    assert len({digest(value) for value in values}) == len(values)
     assert digest(array.astype('>f8')) == digest(array)
     assert digest(np.float64(0.1), np.int64(3)) == digest(0.1, 3)
     with pytest.raises(TypeError, match='Path'):

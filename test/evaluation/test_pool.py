@@ -28,13 +28,13 @@ def test_rollouts_come_in_order_and_say_which_failed(workers):
     itself = ToySimulator(fail_below=30.0)
     with closing(Threads(workers)) as threads:
         pool = Pool(itself, threads)
-        for some in (JOBS, JOBS[:1]):
-            found = pool.simulate(some)
-            failed = [k for k, one in enumerate(found) if isinstance(one, SimulationError)]
-            assert failed == ([1, 4] if some is JOBS else [])
-            for one, job in zip(found, some, strict=True):
-                if not isinstance(one, SimulationError):
-                    assert np.array_equal(one.chains, itself.simulate(*job).chains)
+        for jobs in (JOBS, JOBS[:1]):
+            rollouts = pool.simulate(jobs)
+            failed = [k for k, rollout in enumerate(rollouts) if isinstance(rollout, SimulationError)]
+            assert failed == ([1, 4] if jobs is JOBS else [])
+            for rollout, job in zip(rollouts, jobs, strict=True):
+                if not isinstance(rollout, SimulationError):
+                    assert np.array_equal(rollout.chains, itself.simulate(*job).chains)
         assert pool.simulate([]) == []
         with pytest.raises(RuntimeError, match='the toy'):
             Pool(ToySimulator(crash=True), threads).simulate(JOBS)
@@ -59,12 +59,11 @@ def test_a_stop_ends_what_is_under_way_and_what_waits(workers):
 
 
 def test_rollouts_in_memory_are_not_simulated_again(tmp_path):
-    once = ToySimulator(fail_below=30.0)
+    simulator = ToySimulator(fail_below=30.0)
     with EvaluationLog(tmp_path / 'log') as log:
-        before = Pool(once, memory=Memory(log)).simulate(JOBS[:5])
+        before = Pool(simulator, memory=Memory(log)).simulate(JOBS[:5])
         after = Pool(ToySimulator(crash=True), memory=Memory(log)).simulate(JOBS[:5])
-        for one, other in zip(before, after, strict=True):
-            assert str(one) == str(other)
+        assert list(map(str, before)) == list(map(str, after))
         with pytest.raises(RuntimeError):
             Pool(ToySimulator(crash=True), memory=Memory(log)).simulate(JOBS)
 
@@ -75,15 +74,15 @@ def test_a_batch_stops_at_evaluations_that_are_in_memory_too(tmp_path):
     with EvaluationLog(tmp_path / 'log') as log:
         memory = Memory(log).of(evaluator)
         assert len(list(BatchEvaluator(evaluator, Pool(evaluator.simulator), memory)(points, 0))) == 5
-        taken = []
-        pool = Pool(evaluator.simulator, should_stop=lambda: len(taken) == 3)
+        indices = []
+        pool = Pool(evaluator.simulator, should_stop=lambda: len(indices) == 3)
         for evaluation in BatchEvaluator(evaluator, pool, memory)(points, 0):
-            taken.append(evaluation.index)
-        assert taken == [0, 1, 2]
+            indices.append(evaluation.index)
+        assert indices == [0, 1, 2]
 
 
 @pytest.mark.skipif(sys.platform != 'linux', reason='a thread has no priority of its own')
-def test_threads_that_simulate_come_after_those_that_answer():
+def test_threads_that_simulate_have_a_lower_priority():
     with closing(Threads(1)) as threads:
         def own():
             return os.getpriority(os.PRIO_PROCESS, threading.get_native_id())

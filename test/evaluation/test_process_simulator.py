@@ -49,14 +49,14 @@ def a_job(value=50.0):
     return toy_trials(1)[0], ParameterSpace().physical({'flexibility': value}, 1.0)
 
 
-def until(found):
+def wait_until(condition):
     begun = time.monotonic()
-    while not found():
+    while not condition():
         assert time.monotonic() - begun < PATIENCE
         time.sleep(0.01)
 
 
-def test_it_gives_the_same_and_errors_pass():
+def test_rollouts_and_errors_are_those_of_the_simulator_itself():
     before = simulating(os.getpid())
     with closing(in_process(ToySimulator, 0.0, 30.0)) as away:
         expected = tried(ToySimulator()).residuals.tobytes()
@@ -68,13 +68,13 @@ def test_it_gives_the_same_and_errors_pass():
         there = pickle.loads(pickle.dumps(away))  # noqa: S301  # as other machines get it
         assert (there.name, there._idle) == ('toy', [])
     assert simulating(os.getpid()) == before
-    with closing(in_process(Telling)) as away, pytest.raises(RuntimeError) as told:
+    with closing(in_process(Telling)) as away, pytest.raises(RuntimeError) as error:
         away.simulate(*a_job())
-    process, nice = map(int, str(told.value).split())
+    process, nice = map(int, str(error.value).split())
     assert (process != os.getpid(), nice) == (True, min(os.nice(0) + 5, 19))
 
 
-def test_pybullet_gives_there_what_it_gives_here(scene):
+def test_pybullet_gives_the_same_rollouts_in_its_process(scene):
     bullet = pytest.importorskip('dlo_calibration.simulation.bullet')
     options = Options(engine='bullet', scene=scene, nodes=9, settle_limit=0.1, time_step=0.01)
     engine = bullet.BulletSimulator(scene=scene, nodes=9, settle_limit=0.1, time_step=0.01)
@@ -90,7 +90,7 @@ def test_a_crash_is_reported_with_the_scene_and_the_next_call_works(caplog):
                                                       '3 processes .* was killed by SIGKILL'):
             tried(away, LIMP)
         assert tried(away).residuals is not None
-    assert [one.getMessage() for one in caplog.records] == [
+    assert [record.getMessage() for record in caplog.records] == [
         'a process that simulates the scene peg.urdf was killed by SIGKILL, as happens when memory runs out; '
         'its rollout is repeated'] * 3
 
@@ -100,7 +100,7 @@ def test_a_rollout_whose_process_dies_is_repeated(tmp_path):
         assert tried(away, LIMP).residuals.tobytes() == tried(ToySimulator(), LIMP).residuals.tobytes()
 
 
-def test_a_process_that_died_while_it_had_nothing_to_do_is_replaced():
+def test_an_idle_process_that_died_is_replaced():
     with closing(in_process(ToySimulator)) as away:
         tried(away)
         for pid in simulating(os.getpid()):
@@ -108,7 +108,7 @@ def test_a_process_that_died_while_it_had_nothing_to_do_is_replaced():
         assert tried(away).residuals is not None
 
 
-def test_a_hang_in_native_code_is_ended_and_one_that_is_slow_is_not(monkeypatch):
+def test_a_hanging_process_is_replaced_and_a_slow_one_is_not(monkeypatch):
     monkeypatch.setattr('dlo_calibration.evaluation.process_simulator.DEATHS', 1)
     with closing(in_process(Hanging, limit=1.0)) as away:
         with pytest.raises(DloCalibrationError, match='gave no answer for 1 s .*; raise answer_limit'):
@@ -130,7 +130,7 @@ def test_a_stop_ends_a_rollout_in_its_middle():
 def test_each_thread_has_a_process():
     with closing(in_process(Slow)) as away, closing(Threads(2)) as threads:
         begun = Pool(away, threads).begin([a_job(), a_job()])
-        until(lambda: len(simulating(os.getpid())) == 2)
+        wait_until(lambda: len(simulating(os.getpid())) == 2)
         first, second = begun()
         assert first.chains.tobytes() == second.chains.tobytes()
     assert not simulating(os.getpid())
@@ -177,13 +177,13 @@ def test_kill_9_of_the_parent_leaves_no_process_behind(kind, limit):
         [sys.executable, '-c', PROGRAM.format(kind=kind, limit=limit)], cwd=ROOT, stdout=subprocess.PIPE,
         text=True, env={**os.environ, 'PYTHONPATH': f'{ROOT}:{ROOT}/test/support:{ROOT}/test/evaluation'})
     assert parent.stdout.readline() == 'begins\n'
-    until(lambda: simulating(parent.pid))
+    wait_until(lambda: simulating(parent.pid))
     child, = simulating(parent.pid)
-    until(lambda: os.getpgid(child) == child)  # Ctrl-C in a terminal does not reach it
+    wait_until(lambda: os.getpgid(child) == child)  # Ctrl-C in a terminal does not reach it
     time.sleep(1.0)  # it simulates now
     parent.kill()
     parent.wait()
-    until(lambda: not Path(f'/proc/{child}').exists())
+    wait_until(lambda: not Path(f'/proc/{child}').exists())
 
 
 def test_a_program_that_ends_without_closing_does_not_wait():

@@ -25,16 +25,16 @@ from dlo_calibration.model.parameters import ParameterSpace
 TRUTH = {'flexibility': 40.0, 'elasticity': 30.0, 'friction': 70.0, 'self_collision': 20.0}
 
 
-def test_each_trial_finds_its_chains_in_the_residuals_of_an_evaluation():
+def test_a_layout_splits_residuals_into_the_chains_of_each_trial():
     first, second = (toy_trial(TRUTH, name, n=n) for name, n in (('trial 1', 11), ('trial 2', 7)))
     second = replace(second, goals=(*second.goals, Goal(second.goals[0].chain, 3.0)))
     evaluator = Evaluator((first, second), ParameterSpace(), ToySimulator())
     evaluation = evaluator.evaluate(0, np.full(4, 0.3))
     chains = ResidualLayout.of((first, second)).chains(evaluation.residuals)
     simulated = [ToySimulator().simulate(*job) for job in evaluator.jobs(evaluation.point)]
-    for trial, found, rollout in zip((first, second), chains, simulated, strict=True):
+    for trial, block, rollout in zip((first, second), chains, simulated, strict=True):
         observed = [goal.chain.points for goal in trial.goals]
-        assert np.array_equal(found, rollout.chains - observed)
+        assert np.array_equal(block, rollout.chains - observed)
 
 
 def test_the_folds_of_a_cross_validation_are_neighbouring_trials_that_cover_all():
@@ -66,7 +66,7 @@ def test_few_goals_are_all_compared():
     assert compared_rows([trial, trial]) is None
 
 
-def test_of_a_stream_a_few_goals_evenly_spread_over_time_are_compared():
+def test_the_compared_goals_of_a_stream_are_evenly_spread_over_time():
     trial, _ = stream()
     goals = compared_goals(trial)
     assert len(goals) == MOST_TIMED + 2
@@ -79,18 +79,18 @@ def test_of_a_stream_a_few_goals_evenly_spread_over_time_are_compared():
     assert compared == pytest.approx(np.linspace(0, 19.95, MOST_TIMED), abs=0.051)
 
 
-def test_scores_and_errors_are_those_of_every_goal_residuals_those_of_the_compared_ones():
+def test_scores_and_errors_are_those_of_every_goal_and_residuals_those_of_compared_goals():
     trials, point = stream(), np.full(4, 0.3)
     whole = Evaluator(trials, ParameterSpace(), ToySimulator()).evaluate(0, point)
     evaluator = Evaluator(trials, ParameterSpace(), ToySimulator(), every_goal=False)
-    for one in (evaluator, copy.copy(evaluator), evaluator.of(evaluator.space)):
-        thin = one.evaluate(0, point)
+    for variant in (evaluator, copy.copy(evaluator), evaluator.of(evaluator.space)):
+        thin = variant.evaluate(0, point)
         assert thin.scores == whole.scores
         assert thin.errors == whole.errors
         expected = [block[compared_goals(trial)] for trial, block in zip(
             trials, ResidualLayout.of(trials).chains(whole.residuals), strict=True)]
-        found = ResidualLayout.compared(trials).chains(thin.residuals)
-        assert all(np.array_equal(*pair) for pair in zip(found, expected, strict=True))
+        blocks = ResidualLayout.compared(trials).chains(thin.residuals)
+        assert all(np.array_equal(*pair) for pair in zip(blocks, expected, strict=True))
 
 
 def test_between_compared_goals_a_value_is_interpolated_in_time():
@@ -129,11 +129,11 @@ def test_points_that_were_not_seen_have_no_residuals_and_the_others_keep_theirs(
     layout = ResidualLayout.of(some)
     assert layout.rows[-1].stop == len(thin) < len(whole)
     assert ResidualLayout.compared(some).rows[-1].stop == len(compared) == len(compared_rows(some))
-    for trial, found, expected in zip(some, layout.chains(thin), ResidualLayout.of(trials).chains(whole),
+    for trial, block, expected in zip(some, layout.chains(thin), ResidualLayout.of(trials).chains(whole),
                                       strict=True):
         seen = np.stack([goal.chain.seen for goal in trial.goals])
-        assert np.isnan(found[~seen]).all()
-        assert np.array_equal(found[seen], expected[seen])
+        assert np.isnan(block[~seen]).all()
+        assert np.array_equal(block[seen], expected[seen])
     sizes = at_every_goal(np.linalg.norm(compared.reshape(-1, 3), axis=1), some)
     assert sizes.shape == (len(thin) // 3,)
     assert np.isfinite(sizes).all()

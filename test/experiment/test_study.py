@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The experiment: which calibrations there are, what one finds, and what is written down of it."""
+"""The experiment: its calibrations, their outcomes, and the journal."""
 
 from concurrent.futures import CancelledError
 from dataclasses import replace
@@ -55,20 +55,20 @@ def test_each_search_has_a_number_of_evaluations_of_its_own():
 
 def test_every_run_calibrates_on_all_trials_and_without_each_that_is_held_back():
     subjects = subject(name='a'), subject(held_back=(1,), name='b')
-    study = Study(subjects, ('random', 'cma_es'), 2, 7, 1, 'a command', samples=False)
-    found = list(study.tasks({'a': 'x', 'b': 'y'}))
-    assert [(one.subject.name, one.search, one.left_out) for one in found if one.seed == 7] == [
+    study = Study(subjects, ('random', 'cma_es'), 2, 7, 'a command', samples=False)
+    tasks = list(study.tasks({'a': 'x', 'b': 'y'}))
+    assert [(each.subject.name, each.search, each.left_out) for each in tasks if each.seed == 7] == [
         ('a', 'random', None), ('a', 'random', 0), ('a', 'random', 1), ('a', 'random', 2),
         ('a', 'cma_es', None), ('a', 'cma_es', 0), ('a', 'cma_es', 1), ('a', 'cma_es', 2),
         ('b', 'random', None), ('b', 'random', 1), ('b', 'cma_es', None), ('b', 'cma_es', 1)]
-    assert [one.seed for one in found] == [7] * 12 + [8] * 12
-    assert {one.engine for one in found if one.subject.name == 'b'} == {'y'}
-    assert [trial.name for trial in found[2].trials] == ['trial 1', 'trial 3']
-    assert [trial.name for trial in found[2].judges.trials] == ['trial 2']
-    assert found[0].judges.trials == ()
+    assert [each.seed for each in tasks] == [7] * 12 + [8] * 12
+    assert {each.engine for each in tasks if each.subject.name == 'b'} == {'y'}
+    assert [trial.name for trial in tasks[2].trials] == ['trial 1', 'trial 3']
+    assert [trial.name for trial in tasks[2].judges.trials] == ['trial 2']
+    assert tasks[0].judges.trials == ()
 
 
-def test_one_calibration_finds_what_the_library_finds():
+def test_a_calibration_gives_the_result_of_the_library():
     done = perform(task(search='least_squares', seed=3), toy)
     trials = toy_trials(3)
     options = replace(OPTIONS, search='least_squares', seed=3)
@@ -80,18 +80,18 @@ def test_one_calibration_finds_what_the_library_finds():
     assert done.judgements == ()
 
 
-def test_the_parameters_are_judged_by_the_trial_that_was_left_out():
-    one = task(left_out=1)
-    done = perform(one, toy)
+def test_the_left_out_trial_judges_the_parameters():
+    calibration = task(left_out=1)
+    done = perform(calibration, toy)
     judged, = done.judgements
-    (trial, chains), = judged_chains(one, done, toy)
+    (trial, chains), = judged_chains(calibration, done, toy)
     distances = np.linalg.norm(chains - trial.goals[0].chain.points, axis=2)
     assert trial.name == judged.trial == 'trial 2'
     assert judged.error == pytest.approx(distances.mean())
     assert judged.share == pytest.approx(100 * distances.mean() / trial.initial.length)
 
 
-def test_parts_that_were_found_are_simulated_where_a_trial_judges():
+def test_a_trial_judges_with_the_calibrated_parts():
     seen = []
 
     class Watching(ToySimulator):
@@ -99,8 +99,8 @@ def test_parts_that_were_found_are_simulated_where_a_trial_judges():
             seen.append(physical)
             return super().simulate(trial, physical)
 
-    found = Outcome({'flexibility': 40.0, 'stiffness_2': 75.0})
-    judged_chains(task(left_out=1), found, lambda options: Watching())
+    outcome = Outcome({'flexibility': 40.0, 'stiffness_2': 75.0})
+    judged_chains(task(left_out=1), outcome, lambda options: Watching())
     assert seen[0]['stiffness_2'] == BY_NAME['stiffness_2'].physical(75.0)
 
 
@@ -112,17 +112,17 @@ def test_the_judging_trial_does_not_change_the_parameters():
     trials[1] = Trial(other.name, other.initial, other.actions, (goal,))
     changed = Task(Subject('rope', Observed(tuple(trials), OPTIONS), (1,)), 'least_squares', 1, 'toy', 1)
     honest = task(left_out=1, search='least_squares')
-    one, two = perform(honest, toy), perform(changed, toy)
-    assert one.values == two.values
-    assert two.judgements[0].error == pytest.approx(0.05, rel=0.02)
-    assert one.judgements[0].error < 0.001
+    usual, raised = perform(honest, toy), perform(changed, toy)
+    assert usual.values == raised.values
+    assert raised.judgements[0].error == pytest.approx(0.05, rel=0.02)
+    assert usual.judgements[0].error < 0.001
 
 
 def test_other_trials_judge_where_there_are_some():
     others = Observed(tuple(toy_trials(5)[3:]), OPTIONS)
     done = perform(task(search='least_squares', held_back=(), others=others), toy)
-    assert [one.trial for one in done.judgements] == ['trial 4', 'trial 5']
-    assert max(one.error for one in done.judgements) < 0.001
+    assert [judgement.trial for judgement in done.judgements] == ['trial 4', 'trial 5']
+    assert max(judgement.error for judgement in done.judgements) < 0.001
 
 
 def test_a_parameter_without_effect_is_not_excited():
@@ -200,7 +200,7 @@ def test_a_journal_that_cannot_be_read_is_refused(tmp_path):
         Journal(tmp_path, Outcome.of)
 
 
-def test_a_journal_that_cannot_be_written_says_so_and_still_knows_the_outcome(tmp_path):
+def test_a_journal_that_cannot_be_written_says_so_and_still_has_the_outcome(tmp_path):
     journal = Journal(tmp_path / 'nowhere' / 'x', Outcome.of)
     journal.add(task(), OUTCOME)
     assert journal.failure == 'No such file or directory'

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The report of an experiment: what its tables say, and that they can be read again."""
+"""The tables of an experiment, as Markdown, CSV and a picture."""
 
 import csv
 from dataclasses import replace
@@ -44,7 +44,7 @@ def table(text):
 def test_consistency_has_an_average_and_a_deviation_for_each_parameter():
     text = markdown(ACCOUNT)
     average, *_ = cells(text, 'rope')
-    assert average == ['rope', 'average', '70', '*25*']  # nothing told its elasticity
+    assert average == ['rope', 'average', '70', '*25*']  # no trial shows its elasticity
     assert cells(text, '')[0] == ['', 'standard deviation', '10', '*0*']
 
 

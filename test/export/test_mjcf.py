@@ -17,9 +17,9 @@ NODES = Options(nodes=13)
 FORMS = ('extensible', 'inextensible')
 
 
-def exported(found=None, chain=None, options=NODES, **rest):
+def exported(dlo=None, chain=None, options=NODES, **rest):
     """Return the root element of an exported file."""
-    text = export_mjcf(found or MadeUpDlo(), chain or arc(), options=options, **rest)
+    text = export_mjcf(dlo or MadeUpDlo(), chain or arc(), options=options, **rest)
     return etree.fromstring(text.encode())
 
 
@@ -45,7 +45,7 @@ def loaded():
 
 
 @pytest.mark.parametrize('form', FORMS)
-def test_one_body_follows_the_other_with_joints_of_the_found_stiffness(form):
+def test_bodies_are_nested_with_joints_of_the_calibrated_stiffness(form):
     root, rope = exported(curved(), form=form), ExportedRope.of(curved(), arc(), NODES)
     bodies = list(root.iter('body'))
     assert [body.get('name') for body in bodies] == [f'dlo_{k}' for k in range(12)]
@@ -73,7 +73,7 @@ def test_it_stands_on_its_table_or_on_none():
 
 
 def test_neighbours_do_not_touch():
-    pairs = {(one.get('body1'), one.get('body2')) for one in exported().iter('exclude')}
+    pairs = {(element.get('body1'), element.get('body2')) for element in exported().iter('exclude')}
     assert pairs >= {(f'dlo_{k}', f'dlo_{k + 1}') for k in range(11)}
     assert ('dlo_0', 'dlo_11') not in pairs
 
@@ -104,7 +104,7 @@ def test_mujoco_shows_the_chain_at_the_start(form, loaded):
 
 def test_mujoco_holds_the_rest_shape_without_a_force(loaded):
     fixed = {'natural_curvature': 20.0}
-    found = MadeUpDlo(space=ParameterSpace(PAPER_PARAMETERS, fixed, mass=0.03))
-    _, bent = loaded(export_mjcf(found, arc(2.0 * 0.6), options=Options(nodes=41)))
-    _, other = loaded(export_mjcf(found, straight(), options=Options(nodes=41)))
+    dlo = MadeUpDlo(space=ParameterSpace(PAPER_PARAMETERS, fixed, mass=0.03))
+    _, bent = loaded(export_mjcf(dlo, arc(2.0 * 0.6), options=Options(nodes=41)))
+    _, other = loaded(export_mjcf(dlo, straight(), options=Options(nodes=41)))
     assert np.abs(bent.qfrc_spring).max() < 0.01 * np.abs(other.qfrc_spring).max()

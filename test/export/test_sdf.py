@@ -23,9 +23,9 @@ def with_values(**fixed):
     return MadeUpDlo(space=ParameterSpace(PAPER_PARAMETERS, fixed, mass=0.03))
 
 
-def model_of(found, chain, options=OPTIONS):
+def model_of(dlo, chain, options=OPTIONS):
     """Return the model in the file."""
-    return etree.fromstring(export_sdf(found, chain, options=options).encode()).find('model')
+    return etree.fromstring(export_sdf(dlo, chain, options=options).encode()).find('model')
 
 
 def numbers(element, path):
@@ -35,7 +35,8 @@ def numbers(element, path):
 
 def poses(model):
     """Return the poses of the links."""
-    return [Pose(one[:3], one[3:]) for one in (numbers(link, 'pose') for link in model.findall('link'))]
+    return [Pose(values[:3], values[3:]) for values in (
+        numbers(link, 'pose') for link in model.findall('link'))]
 
 
 def turned(axis, angle):
@@ -48,26 +49,26 @@ def at_rest(model):
     """Return the nodes, (n, 3), where all springs are free of stress."""
     start, joints = poses(model), model.findall('joint')[::-1]
     rotation, points = start[0].rotation, [np.zeros(3)]
-    for one, other, joint in zip(start[:-1], start[1:], joints, strict=True):
-        points.append(points[-1] + rotation @ [np.linalg.norm(other.position - one.position), 0, 0])
+    for pose, following, joint in zip(start[:-1], start[1:], joints, strict=True):
+        points.append(points[-1] + rotation @ [np.linalg.norm(following.position - pose.position), 0, 0])
         first, second = (turned(numbers(axis, 'xyz'), numbers(axis, 'dynamics/spring_reference')[0])
                          for axis in (joint.find('axis'), joint.find('axis2')))
-        rotation = rotation @ one.rotation.T @ other.rotation @ first @ second
+        rotation = rotation @ pose.rotation.T @ following.rotation @ first @ second
     return np.array([*points, points[-1] + rotation @ [np.linalg.norm(points[1]), 0, 0]])
 
 
 def test_the_links_stand_as_the_chain():
     model, chain = model_of(MadeUpDlo(), arc()), arc()
     assert [link.get('name') for link in model.findall('link')] == [f'dlo_{k}' for k in range(12)]
-    starts = np.array([one.position for one in poses(model)])
+    starts = np.array([pose.position for pose in poses(model)])
     assert starts == pytest.approx(chain.resample(np.linspace(0, chain.length, 13))[:-1], abs=5e-4)
-    for one, other in zip(poses(model)[:-1], poses(model)[1:], strict=True):
-        assert one.points(np.array([numbers(model, 'link/collision/geometry/box/size')[0], 0, 0])
-                          ) == pytest.approx(other.position)
+    for pose, following in zip(poses(model)[:-1], poses(model)[1:], strict=True):
+        assert pose.points(np.array([numbers(model, 'link/collision/geometry/box/size')[0], 0, 0])
+                          ) == pytest.approx(following.position)
 
 
 @pytest.mark.parametrize('axis', ['axis', 'axis2'])
-def test_the_springs_have_the_stiffness_and_the_damping_that_was_found(axis):
+def test_the_springs_have_the_calibrated_stiffness_and_damping(axis):
     rope = ExportedRope.of(with_values(stiffness_2=70.0, internal_damping=50.0), arc(), OPTIONS)
     joints = model_of(with_values(stiffness_2=70.0, internal_damping=50.0), arc()).findall('joint')[::-1]
     stiffness = [numbers(joint, f'{axis}/dynamics/spring_stiffness')[0] for joint in joints]
@@ -83,9 +84,9 @@ def test_a_bent_start_is_under_stress_until_it_is_straight(angle):
 
 
 def test_a_curved_rest_shape_is_where_the_springs_are_free_of_stress():
-    found = with_values(natural_curvature=30.0)
-    points = at_rest(model_of(found, arc(2.0)))
-    expected = rest_shape(ExportedRope.of(found, arc(2.0), OPTIONS).natural_curvature, 0.6)
+    dlo = with_values(natural_curvature=30.0)
+    points = at_rest(model_of(dlo, arc(2.0)))
+    expected = rest_shape(ExportedRope.of(dlo, arc(2.0), OPTIONS).natural_curvature, 0.6)
     between = [np.linalg.norm(shape[:, None] - shape, axis=-1) for shape in (points, expected)]
     assert between[0] == pytest.approx(between[1], abs=1e-4)
 
@@ -105,7 +106,7 @@ def test_the_links_weigh_what_the_dlo_and_its_markers_weigh():
     masses = [numbers(link, 'inertial/mass')[0] for link in model.findall('link')]
     assert sum(masses) == pytest.approx(0.03 + 3 * marker)
     assert masses[0] == pytest.approx(0.03 / 12 + marker)
-    centre = sum(mass * (one.position[0] + numbers(link, 'inertial/pose')[0]) for mass, one, link in zip(
+    centre = sum(mass * (pose.position[0] + numbers(link, 'inertial/pose')[0]) for mass, pose, link in zip(
         masses, poses(model), model.findall('link'), strict=True))
     assert centre == pytest.approx(0.3 * sum(masses))
 
@@ -129,12 +130,12 @@ def test_a_verdict_of_a_stranger_cannot_end_the_comment():
     class Hostile(MadeUpDlo):
         @property
         def parameters(self):
-            return {name: replace(one, verdict='--><link name="x"/>\0')
-                    for name, one in super().parameters.items()}
+            return {name: replace(estimate, verdict='--><link name="x"/>\0')
+                    for name, estimate in super().parameters.items()}
 
     model = model_of(Hostile(), straight())
     assert model.find("link[@name='x']") is None
-    assert 'EI: 0.00' in model.find('.').getchildren()[0].text
+    assert 'stiffness EI: ' in model.find('.').getchildren()[0].text
 
 
 def test_drake_reads_it():

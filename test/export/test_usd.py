@@ -23,9 +23,9 @@ def with_values(**fixed):
     return MadeUpDlo(space=ParameterSpace(PAPER_PARAMETERS, fixed, mass=0.03))
 
 
-def text_of(found, chain, form='newton-1.6'):
+def text_of(dlo, chain, form='newton-1.6'):
     """Return the text of a file."""
-    return export_usd(found, chain, form=form, options=OPTIONS)
+    return export_usd(dlo, chain, form=form, options=OPTIONS)
 
 
 def value(text, name):
@@ -45,7 +45,7 @@ def test_the_curve_lies_as_the_chain():
         chain.resample(np.linspace(0, chain.length, 13)), abs=5e-4)
 
 
-def test_the_stiffnesses_are_those_found():
+def test_the_stiffnesses_are_the_calibrated_ones():
     text = text_of(with_values(torsion=50.0, internal_damping=50.0), arc())
     rope = ExportedRope.of(with_values(torsion=50.0, internal_damping=50.0), arc(), OPTIONS)
     assert value(text, 'physics:curvesStretchStiffness') == pytest.approx(rope.stretching_stiffness)
@@ -89,8 +89,8 @@ def test_a_dlo_without_natural_curvature_is_straight_at_rest():
 
 
 def test_the_rest_shape_bends_to_the_side_on_which_the_frames_are_curved():
-    found = with_values(natural_curvature=30.0)
-    text, rope = text_of(found, arc(2.0)), ExportedRope.of(found, arc(2.0), OPTIONS)
+    dlo = with_values(natural_curvature=30.0)
+    text, rope = text_of(dlo, arc(2.0)), ExportedRope.of(dlo, arc(2.0), OPTIONS)
     points = vectors(text, 'physics:restShapePoints')
     expected = rope.points[0] + rest_shape(rope.natural_curvature, rope.length) @ rope.frames[0].T
     assert points == pytest.approx(expected, abs=1e-6)
@@ -110,8 +110,8 @@ def test_a_verdict_of_a_stranger_cannot_end_the_text():
     class Hostile(MadeUpDlo):
         @property
         def parameters(self):
-            return {name: replace(one, verdict='\\"""\n)\ndef Xform "x" {}\0')
-                    for name, one in super().parameters.items()}
+            return {name: replace(estimate, verdict='\\"""\n)\ndef Xform "x" {}\0')
+                    for name, estimate in super().parameters.items()}
 
     text = text_of(Hostile(), straight())
     assert '\0' not in text
@@ -147,10 +147,10 @@ def test_usd_core_finds_no_fault_in_it(form, tmp_path):
     for prim in stage.Traverse():
         for attribute in prim.GetAuthoredAttributes():
             name, definition = attribute.GetName(), prim.GetPrimDefinition()
-            known = definition.GetAttributeDefinition(name)
+            declared = definition.GetAttributeDefinition(name)
             assert attribute.Get() is not None, name
-            if known:
-                assert attribute.GetTypeName() == known.GetTypeName(), name
+            if declared:
+                assert attribute.GetTypeName() == declared.GetTypeName(), name
             else:
                 of_proposal.add(name.split(':')[0])
     assert of_proposal <= {'physics', 'newton'}
@@ -163,9 +163,9 @@ def test_newton_reads_mass_stiffness_damping_friction_and_rest_shape(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter('error', newton.NewtonWarning)
         builder.add_usd(str(tmp_path / 'dlo.usda'))
-    found = with_values(natural_curvature=30.0, marker_mass=60.0, self_collision=100.0)
+    dlo = with_values(natural_curvature=30.0, marker_mass=60.0, self_collision=100.0)
     chain = Chain(arc().points, features=np.isin(np.arange(21), [0, 10]))
-    rope = ExportedRope.of(found, chain, OPTIONS)
+    rope = ExportedRope.of(dlo, chain, OPTIONS)
     assert sum(builder.body_mass) == pytest.approx(0.03 + rope.marker_masses.sum(), rel=1e-5)
     stiffness = np.reshape(builder.joint_target_ke[-6 * 11:], (11, 6))
     assert stiffness[:, 2] == pytest.approx(rope.stretching_stiffness / rope.cells, rel=1e-4)

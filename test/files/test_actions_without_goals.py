@@ -48,8 +48,8 @@ def test_a_request_without_goals_is_written_and_read_but_not_fitted(tmp_path):
     write_request(tmp_path / 'request.xml', request)
     read = read_request(tmp_path / 'request.xml')
     assert read.document == request.document
-    found, = request_manipulations(read, Options())
-    assert [step.actions for step in found.steps] == [(actions[0],), (actions[1],)]
+    done, = request_manipulations(read, Options())
+    assert [step.actions for step in done.steps] == [(actions[0],), (actions[1],)]
     trials, (refusal,) = request_trials(read, Options())
     assert trials == () and "trial 'one': no goal chain; expected at least one" in refusal
 
@@ -61,26 +61,27 @@ def test_only_the_trials_with_a_goal_are_fitted():
                        TrialRequest('observed', straight(), (drag,), (goal,))))
     (trial,), (refusal,) = request_trials(request, Options())
     assert trial.name == 'observed' and "'to simulate'" in refusal
-    assert [one.name for one in request_manipulations(request, Options())] == ['to simulate', 'observed']
+    names = [manipulation.name for manipulation in request_manipulations(request, Options())]
+    assert names == ['to simulate', 'observed']
 
 
 def test_actions_of_different_hands_that_overlap_are_one_step():
-    found = manipulation(path('left', 0.0, 2.0), path('right', 1.0, 3.0, 20), path('left', 3.0, 4.0))
-    assert [[one.hands[0].name for one in step.actions] for step in found.steps] == [
+    whole = manipulation(path('left', 0.0, 2.0), path('right', 1.0, 3.0, 20), path('left', 3.0, 4.0))
+    assert [[action.hands[0].name for action in step.actions] for step in whole.steps] == [
         ['left', 'right'], ['left']]
-    assert found.steps[0].name == 'hand_paths' and not found.warnings
-    together = simulate(MadeUpDlo(), straight(), found.steps[:1], draws=0).steps[0].step.action
+    assert whole.steps[0].name == 'hand_paths' and not whole.warnings
+    together = simulate(MadeUpDlo(), straight(), whole.steps[:1], draws=0).steps[0].step.action
     assert {hand.name: (hand.start, hand.end) for hand in together.hands} == {
         'left': (0, 2), 'right': (1, 3)}
 
 
 def test_one_hand_never_acts_twice_at_once():
-    found = manipulation(path('left', 0.0, 2.0), path('right', 0.0, 5.0, 20), path('left', 3.0, 4.0))
-    assert [len(step.actions) for step in found.steps] == [2, 1]
-    assert 'left acts again at 3 s' in found.warnings[0]
+    whole = manipulation(path('left', 0.0, 2.0), path('right', 0.0, 5.0, 20), path('left', 3.0, 4.0))
+    assert [len(step.actions) for step in whole.steps] == [2, 1]
+    assert 'left acts again at 3 s' in whole.warnings[0]
     drags = [Drag(point=k, direction=(0, 1, 0), distance=0.1) for k in range(3)]
-    found = manipulation(*drags)  # nobody said when they begin
-    assert [step.actions for step in found.steps] == [(drag,) for drag in drags] and not found.warnings
+    whole = manipulation(*drags)  # nobody said when they begin
+    assert [step.actions for step in whole.steps] == [(drag,) for drag in drags] and not whole.warnings
 
 
 def test_overlapping_named_actions_have_both_names():
@@ -99,7 +100,7 @@ def test_whether_explicit_paths_hold_is_an_option(release, held_by):
     assert step.held_by == held_by
 
 
-def test_a_goal_says_which_hands_hold():
+def test_a_goal_names_the_holding_hands():
     goals = (GoalRequest(straight(), 3.0, held_by=('left',)), GoalRequest(straight(), 9.0))
     first, second = manipulation(path('left', 0.0, 2.0), path('right', 5.0, 6.0, 20), goals=goals).steps
     assert (first.held_by, second.held_by) == (('left',), ('left',))
@@ -124,15 +125,15 @@ def test_too_many_actions_are_refused():
 def recorded(tmp_path, messages, options=None):
     """Return a session with (stamp [s], chain or hands) messages; a chain after an action is a goal."""
     types, pairs, kind = bag_types(), [], INITIAL
-    for stamp, one in messages:
+    for stamp, content in messages:
         nanoseconds = round(stamp * SECOND)
-        if isinstance(one, Chain):
-            pairs.append((kind, chain_cloud(types, one, nanoseconds, 'world')))
+        if isinstance(content, Chain):
+            pairs.append((kind, chain_cloud(types, content, nanoseconds, 'world')))
             continue
-        names = tuple(hand.name for hand in one)
+        names = tuple(hand.name for hand in content)
         pairs.append((ACTION, action_trajectory(types, ActionMessage(
-            nanoseconds, 'world', names, one[0].times, np.stack([hand.positions for hand in one], 1),
-            np.stack([hand.orientations for hand in one], 1)))))
+            nanoseconds, 'world', names, content[0].times, np.stack([hand.positions for hand in content], 1),
+            np.stack([hand.orientations for hand in content], 1)))))
         kind = GOAL
     return read_session(write_session(tmp_path / 'recorded.mcap', pairs, options))
 
@@ -141,11 +142,11 @@ def test_a_session_without_goals_has_manipulations_but_no_trials(tmp_path):
     hand = Hand('left', (3,), [0.0, 2.0], [straight().points[3], (0.1, 0.1, 0.004)])
     session = recorded(tmp_path, [(1, straight()), (2, [hand])])
     assert session_trials(session, Options())[0] == ()
-    (found,), problems = session_manipulations(session, Options())
-    assert problems == ()
-    np.testing.assert_allclose(found.start.points, straight().points, atol=1e-6)  # float32
-    (action,) = found.steps[0].actions
-    assert action.hands[0].grips == (3,) and found.steps[0].held_by == ()
+    (done,), refusals = session_manipulations(session, Options())
+    assert refusals == ()
+    np.testing.assert_allclose(done.start.points, straight().points, atol=1e-6)  # float32
+    (action,) = done.steps[0].actions
+    assert action.hands[0].grips == (3,) and done.steps[0].held_by == ()
     np.testing.assert_allclose(action.hands[0].positions, hand.positions)
 
 
@@ -156,14 +157,14 @@ def test_later_hands_grip_the_predicted_chain(tmp_path):
 
     session = recorded(tmp_path, [(1, straight()), (2, drag((0.3, 0, 0.004), (0.3, 0.2, 0.004))),
                                   (9, drag((0.3, 0.2, 0.004), (0.35, 0.3, 0.004)))])
-    (found,), problems = session_manipulations(session, Options())
-    assert problems == ()
-    first, second = simulate(MadeUpDlo(), found.start, found.steps, draws=0).steps
+    (done,), refusals = session_manipulations(session, Options())
+    assert refusals == ()
+    first, second = simulate(MadeUpDlo(), done.start, done.steps, draws=0).steps
     assert [step.step.action.hands[0].grips for step in (first, second)] == [(10,), (10,)]
     assert second.chain[10, 1] == pytest.approx(0.3, abs=0.01)
-    far = replace(found.steps[1].actions[0], positions=np.full((2, 1, 3), 0.5))
+    far = replace(done.steps[1].actions[0], positions=np.full((2, 1, 3), 0.5))
     with pytest.raises(InputError, match='m from any point of the predicted chain; expected at most 0.02'):
-        simulate(MadeUpDlo(), found.start, [found.steps[0], replace(found.steps[1], actions=(far,))], draws=0)
+        simulate(MadeUpDlo(), done.start, [done.steps[0], replace(done.steps[1], actions=(far,))], draws=0)
 
 
 def test_goals_of_a_session_change_nothing_but_who_holds(tmp_path):
@@ -172,9 +173,10 @@ def test_goals_of_a_session_change_nothing_but_who_holds(tmp_path):
     with_goal = read_session(write_session(tmp_path / 'with.mcap', trial_messages(types, trial, SECOND)))
     without = read_session(write_session(tmp_path / 'without.mcap', trial_messages(
         types, replace(trial, goals=trial.goals), SECOND)[:2]))
-    one, other = (session_manipulations(session, Options())[0][0] for session in (with_goal, without))
-    np.testing.assert_array_equal(one.start.points, other.start.points)
-    for step, same in zip(one.steps, other.steps, strict=True):
+    observed, unobserved = (session_manipulations(session, Options())[0][0]
+                            for session in (with_goal, without))
+    np.testing.assert_array_equal(observed.start.points, unobserved.start.points)
+    for step, same in zip(observed.steps, unobserved.steps, strict=True):
         assert step.held_by == same.held_by
         for hand, again in zip(step.actions[0].hands, same.actions[0].hands, strict=True):
             assert hand.grips == again.grips
@@ -184,13 +186,13 @@ def test_goals_of_a_session_change_nothing_but_who_holds(tmp_path):
 def test_an_action_far_from_the_first_chain_is_refused(tmp_path):
     far = Hand('left', (0,), [0.0, 1.0], [(2.0, 0, 0), (2.0, 1, 0)])
     near = Hand('left', (0,), [0.0, 1.0], [straight().points[0], (0.0, 0.1, 0.004)])
-    found, (problem,) = session_manipulations(recorded(tmp_path, [
+    manipulations, (refusal,) = session_manipulations(recorded(tmp_path, [
         (1, straight()), (2, [far]), (5, [near])]), Options())
-    assert len(found) == len(found[0].steps) == 1
-    assert 'closing 1.4 m from any point' in problem
+    assert len(manipulations) == len(manipulations[0].steps) == 1
+    assert 'closing 1.4 m from any point' in refusal
 
 
 def test_an_action_before_any_chain_is_refused(tmp_path):
     hand = Hand('left', (0,), [0.0, 1.0], [straight().points[0], (0.0, 0.1, 0.004)])
-    found, (problem,) = session_manipulations(recorded(tmp_path, [(1, [hand])]), Options())
-    assert found == () and 'no initial_chain before it' in problem
+    manipulations, (refusal,) = session_manipulations(recorded(tmp_path, [(1, [hand])]), Options())
+    assert manipulations == () and 'no initial_chain before it' in refusal

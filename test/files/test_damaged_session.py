@@ -39,7 +39,7 @@ def write_mcap(path, chunking, compression=CompressionType.NONE):
 
 def missing(session):
     """Return how many of the good messages a session has not."""
-    return sum((Counter(GOOD) - Counter((one.name, one.data) for one in session.records)).values())
+    return sum((Counter(GOOD) - Counter((record.name, record.data) for record in session.records)).values())
 
 
 @pytest.fixture(scope='module', params=['ours', *CHUNKED, None], ids=str)
@@ -56,23 +56,23 @@ def recording(request, tmp_path_factory):
         chunks = make_reader(stream).get_summary().chunk_indexes
     assert len(chunks) > 3
     sizes = Counter()
-    for one in chunks:  # messages are at a second each
-        sizes[one.chunk_start_offset] = (one.message_end_time - one.message_start_time) // SECOND + 1
+    for chunk in chunks:  # messages are at a second each
+        sizes[chunk.chunk_start_offset] = (chunk.message_end_time - chunk.message_start_time) // SECOND + 1
     return path.read_bytes(), max(sizes.values())
 
 
 def test_a_wrong_bit_costs_at_most_its_chunk(recording, tmp_path):
     octets, allowed = recording
-    dice, path, told = random.Random(5), tmp_path / 'flipped.mcap', 0
+    dice, path, warned = random.Random(5), tmp_path / 'flipped.mcap', 0
     for _ in range(FLIPS):
         flipped = bytearray(octets)
         place = dice.randrange(len(octets))
         flipped[place] ^= 1 << dice.randrange(8)
         path.write_bytes(flipped)
-        found = read_session(path)
-        assert missing(found) <= allowed, place
-        told += bool(found.problems)
-    assert told  # an undamaged file has no problem
+        session = read_session(path)
+        assert missing(session) <= allowed, place
+        warned += bool(session.warnings)
+    assert warned  # an undamaged file has no warning
 
 
 @pytest.mark.parametrize('piece', [b'', bytes(100), b'\xff' * 100, b'\x06' * 9, b'\x05\x16' + bytes(7)],
@@ -82,9 +82,9 @@ def test_bytes_that_came_in_between_cost_at_most_their_chunk(recording, tmp_path
     path = tmp_path / 'longer.mcap'
     place = octets.index(GOOD[8][1]) if GOOD[8][1] in octets else len(octets) // 3
     path.write_bytes(octets[:place] + piece + octets[place + (not piece):])
-    found = read_session(path)
-    assert missing(found) <= allowed
-    assert any(path.name in problem and 'damaged' in problem for problem in found.problems)
+    session = read_session(path)
+    assert missing(session) <= allowed
+    assert any(path.name in warning and 'damaged' in warning for warning in session.warnings)
 
 
 def test_lost_messages_are_counted(tmp_path):
@@ -94,20 +94,20 @@ def test_lost_messages_are_counted(tmp_path):
     octets = bytearray(path.read_bytes())
     octets[second.chunk_start_offset + second.chunk_length - 5] ^= 16
     path.write_bytes(octets)
-    found = read_session(path)
-    problem, = found.problems
-    assert f'chunk at byte {second.chunk_start_offset}' in problem
-    assert f'{len(GOOD) - missing(found)} of its {len(GOOD)} message(s) were read' in problem
-    assert 0 < missing(found) < len(GOOD)
+    session = read_session(path)
+    warning, = session.warnings
+    assert f'chunk at byte {second.chunk_start_offset}' in warning
+    assert f'{len(GOOD) - missing(session)} of its {len(GOOD)} message(s) were read' in warning
+    assert 0 < missing(session) < len(GOOD)
 
 
 def test_a_damaged_part_of_a_folder_costs_no_other_part(tmp_path):
     folder = write_session(tmp_path / 'session', session_messages(bag_types(), 2))
     (folder / 'other.mcap').write_bytes(b'no recording')
     (folder / 'metadata.yaml').unlink()
-    found = read_session(folder)
-    assert len(found.messages) == 6
-    assert any('other.mcap' in problem or 'does not begin' in problem for problem in found.problems)
+    session = read_session(folder)
+    assert len(session.messages) == 6
+    assert any('other.mcap' in warning or 'does not begin' in warning for warning in session.warnings)
 
 
 def test_a_damaged_page_of_a_database_costs_its_rows_only(tmp_path):
@@ -123,9 +123,9 @@ def test_a_damaged_page_of_a_database_costs_its_rows_only(tmp_path):
               if whole[place] == 13 and GOOD[9][1] in whole[place:place + page])  # 13: a page of rows
     path.write_bytes(whole[:at] + b'\xff' * page + whole[at + page:])
     inside = sum(octets in whole[at:at + page] for _, octets in GOOD)
-    found = read_session(path)
-    assert 0 < missing(found) <= inside + 1 < len(GOOD)
-    assert any('bag.db3' in problem and 'damaged' in problem for problem in found.problems)
+    session = read_session(path)
+    assert 0 < missing(session) <= inside + 1 < len(GOOD)
+    assert any('bag.db3' in warning and 'damaged' in warning for warning in session.warnings)
 
 
 def test_a_cut_session_without_its_summary_is_read_around_damage(tmp_path):

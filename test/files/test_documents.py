@@ -6,6 +6,7 @@
 import argparse
 from pathlib import Path
 import re
+import shlex
 
 from made_up_dlo import made_up_plan
 import pytest
@@ -25,8 +26,8 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def headings(path):
     """Return the headings of a document, as links name them."""
-    found = re.findall('^#+ (.*)$', path.read_text(encoding='utf-8'), re.MULTILINE)
-    return {re.sub(r'[^\w -]', '', one).lower().replace(' ', '-') for one in found}
+    titles = re.findall('^#+ (.*)$', path.read_text(encoding='utf-8'), re.MULTILINE)
+    return {re.sub(r'[^\w -]', '', title).lower().replace(' ', '-') for title in titles}
 
 
 def sections():
@@ -69,14 +70,14 @@ def test_every_topic_is_documented():
 def test_every_verb_is_documented_with_its_own_flags():
     text = (ROOT / 'doc/commands.md').read_text(encoding='utf-8')
     first, common, *verbs = text.split('\n## ')
-    told = {text.partition('\n')[0]: text for text in verbs}
-    assert set(told) == set(main.VERBS) == set(re.findall('^\\| \\[`(.*?)`\\]', first, re.MULTILINE))
+    verb_texts = {text.partition('\n')[0]: text for text in verbs}
+    assert set(verb_texts) == set(main.VERBS) == set(re.findall('^\\| \\[`(.*?)`\\]', first, re.MULTILINE))
     for verb in main.VERBS:
         parser = argparse.ArgumentParser(add_help=False)
         main.module_of(verb).add_arguments(parser)
         for flag in (action for action in parser._actions if not action.dest.startswith(PREFIX)):
             for word in flag.option_strings or [flag.metavar]:
-                assert word in f'{told[verb]}{common}', f'{verb} {word}'
+                assert word in f'{verb_texts[verb]}{common}', f'{verb} {word}'
 
 
 def test_every_key_of_the_planners_status_is_documented(monkeypatch):
@@ -99,9 +100,8 @@ def test_every_key_of_a_plan_is_documented():
 
 
 @pytest.mark.parametrize('document', [
-    'README.md', 'CONTRIBUTING.md', 'QUALITY_DECLARATION.md', 'doc/capture.md', 'doc/commands.md',
-    'doc/guide.md', 'doc/messages.md', 'doc/formats.md', 'doc/physics.md', 'doc/planning.md', 'doc/report.md',
-    'doc/experiment.md', 'msg_samples/README.md', 'msg_samples/photographs/README.md', 'benchmark/README.md'])
+    path.relative_to(ROOT).as_posix() for folder in ('', 'benchmark/', 'doc/', 'msg_samples/**/')
+    for path in sorted(ROOT.glob(f'{folder}*.md'))])
 def test_links_lead_somewhere(document):
     text = (ROOT / document).read_text(encoding='utf-8')
     for target, heading in re.findall(r'\]\(([^)#]*)#?([^)]*)\)', text):
@@ -109,3 +109,37 @@ def test_links_lead_somewhere(document):
             path = (ROOT / document).parent / target if target else ROOT / document
             assert path.exists(), target
             assert not heading or heading in headings(path), f'{target}#{heading}'
+
+
+def indented(document):
+    """Return the indented paragraphs of a document, each in one line."""
+    paragraphs = re.findall(r'(?:^ {4}.*\n)+', (ROOT / document).read_text(encoding='utf-8'), re.MULTILINE)
+    return [' '.join(paragraph.replace('\\\n', ' ').split()) for paragraph in paragraphs]
+
+
+def split(text):
+    """Return a text in one line with # for each number, and the numbers."""
+    line, number = ' '.join(text.split()), r'\d+(?:\.\d+)?'
+    return re.sub(number, '#', line), [float(value) for value in re.findall(number, line)]
+
+
+@pytest.mark.long
+@pytest.mark.pybullet
+@pytest.mark.parametrize('document, count', [('README.md', 1), ('doc/planning.md', 3)])
+def test_commands_print_what_the_documents_show(document, count, tmp_path, monkeypatch, capsys):
+    """Words are the same; numbers may differ by 2 %, as libraries round differently."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'msg_samples').symlink_to(ROOT / 'msg_samples')
+    paragraphs = indented(document)
+    shown = [(re.search(r'dlo-calibration (\w+ msg_samples.*)', command), output)
+             for command, output in zip(paragraphs, paragraphs[1:], strict=False)]
+    commands = [(match[1], output) for match, output in shown if match]
+    assert len(commands) == count
+    for command, output in commands:
+        assert main.main(shlex.split(command)) == 0
+        words, numbers = split(capsys.readouterr().out)
+        for part in output.split(' ... '):
+            expected, values = split(part)
+            assert expected in words
+            first = words[:words.index(expected)].count('#')
+            assert numbers[first:first + len(values)] == pytest.approx(values, rel=0.02)

@@ -77,8 +77,8 @@ def test_an_unexpected_error_of_one_message_costs_no_other(folder, monkeypatch):
 
 def test_messages_of_other_topics_are_counted_not_kept(tmp_path, command):
     path = with_images(tmp_path / 'a.mcap', 40, 1000)
-    found = read_session(path)
-    assert len(found.records) == len(found.messages) == len(GOOD)
+    session = read_session(path)
+    assert len(session.records) == len(session.messages) == len(GOOD)
     code, about, _ = command('info', path, '--json')
     assert (code, about['messages']['/camera'], len(about['trials'])) == (0, 40, 2)
 
@@ -96,10 +96,10 @@ def test_messages_before_a_limit_are_used(tmp_path, monkeypatch, name, value, wo
             for kind, message in GOOD:
                 octets = encode(message, INPUT_TYPES[kind])
                 writer.write(f'/calibrator/{kind}', INPUT_TYPES[kind], octets, k + 1, flush=k == 0)
-    found = read_session(writer.path)
-    assert 0 < len(found.records) < 8 * len(GOOD)
-    problem, = found.problems
-    assert words in problem and 'split the recording' in problem
+    session = read_session(writer.path)
+    assert 0 < len(session.records) < 8 * len(GOOD)
+    warning, = session.warnings
+    assert words in warning and 'split the recording' in warning
 
 
 @pytest.mark.parametrize('compression', ['zstd', 'lz4', ''])
@@ -128,7 +128,7 @@ def test_damaged_content_counts_as_unpacked_too(tmp_path, monkeypatch, damaged):
     octets = path.read_bytes()
     end = octets.index(b'\x0f\4\0\0\0\0\0\0\0')
     path.write_bytes(octets[:end] + record * 20 + octets[end:])
-    assert any('unpacks to more than 1 MB' in problem for problem in read_session(path).problems)
+    assert any('unpacks to more than 1 MB' in warning for warning in read_session(path).warnings)
 
 
 @pytest.mark.parametrize('make, came', [
@@ -146,10 +146,10 @@ def test_special_files_and_links_out_of_a_folder_are_left_out(folder, tmp_path):
     (tmp_path / 'b.mcap').write_bytes(b'private')
     (folder / 'b.mcap').symlink_to(tmp_path / 'b.mcap')
     (folder / 'metadata.yaml').unlink()
-    found = read_session(folder)
-    assert len(found.messages) == len(GOOD)
+    session = read_session(folder)
+    assert len(session.messages) == len(GOOD)
     for name in ('a.mcap', 'b.mcap'):
-        assert any(name in problem for problem in found.problems)
+        assert any(name in warning for warning in session.warnings)
 
 
 def test_a_link_within_a_folder_is_followed(folder):
@@ -165,17 +165,17 @@ def test_a_link_within_a_folder_is_followed(folder):
     'rosbag2_bagfile_information: {relative_file_paths: a}'], ids=['aliases', 'nested', 'large', 'no list'])
 def test_metadata_that_is_no_rosbag2s_is_left_out(folder, text):
     (folder / 'metadata.yaml').write_text(text)
-    found = read_session(folder)
-    assert len(found.messages) == len(GOOD)
-    problem, = found.problems
-    assert 'metadata.yaml cannot be read' in problem
+    session = read_session(folder)
+    assert len(session.messages) == len(GOOD)
+    warning, = session.warnings
+    assert 'metadata.yaml cannot be read' in warning
 
 
 def test_metadata_with_more_events_than_the_limit_is_left_out(folder, monkeypatch):
     monkeypatch.setattr(reading, 'MAXIMUM_EVENTS', 50)
-    found = read_session(folder)
-    assert len(found.messages) == len(GOOD)
-    assert any('metadata.yaml cannot be read' in problem for problem in found.problems)
+    session = read_session(folder)
+    assert len(session.messages) == len(GOOD)
+    assert any('metadata.yaml cannot be read' in warning for warning in session.warnings)
 
 
 @pytest.mark.parametrize('text', ['[' * 50_000, '{"seed": 1', '3', f'{{"x": "{"y" * 10**5}"}}'])
@@ -184,10 +184,10 @@ def test_recorded_options_that_cannot_be_read_are_left_out(tmp_path, text):
         for k, (kind, message) in enumerate(GOOD):
             writer.write(f'/calibrator/{kind}', INPUT_TYPES[kind], encode(message, INPUT_TYPES[kind]), k + 1)
         writer._writer.add_metadata(OUR_RECORD, {'options': text})
-    found = read_session(writer.path)
-    assert (len(found.messages), found.recorded) == (len(GOOD), None)
-    problem, = found.problems
-    assert 'options' in problem
+    session = read_session(writer.path)
+    assert (len(session.messages), session.file_options) == (len(GOOD), None)
+    warning, = session.warnings
+    assert 'options' in warning
 
 
 def test_undecodable_messages_give_one_warning_for_each_topic(tmp_path):
@@ -197,10 +197,10 @@ def test_undecodable_messages_give_one_warning_for_each_topic(tmp_path):
         for k in range(50):
             octets = b'\0\1\0\0' + struct.pack('<I', k)
             writer.write(f'/calibrator/{GOAL}', INPUT_TYPES[GOAL], octets, 100 + k)
-    found = read_session(writer.path)
-    assert len(found.messages) == len(GOOD)
-    problem, = found.problems
-    assert '49 more' in problem and GOAL in problem
+    session = read_session(writer.path)
+    assert len(session.messages) == len(GOOD)
+    warning, = session.warnings
+    assert '49 more' in warning and GOAL in warning
 
 
 def test_decoded_messages_are_not_kept(folder):
@@ -242,14 +242,14 @@ def database(path, definition=None):
     return root
 
 
-#: Prints why each file cannot be read, or its problems.
+#: Prints why each file cannot be read, or its warnings.
 READ = """
 import sys
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.session import read_session
 for path in sys.argv[1:]:
     try:
-        print(read_session(path, any_topics=True).problems)
+        print(read_session(path, any_topics=True).warnings)
     except InputError as error:
         print(error)
 """

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from toy_messages import toy_trials
 
-from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.options import FileOptions, Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.recording import SessionWriter
 from dlo_calibration.files.request import (
@@ -44,8 +44,8 @@ def assert_on_the_table(trials):
 
 def record(path, trials, **options):
     with SessionWriter(path, options) as writer:
-        for one in trial_records(trials, 'camera'):
-            writer.write(one.topic, one.type, one.data, one.log_time)
+        for message in trial_records(trials, 'camera'):
+            writer.write(message.topic, message.type, message.data, message.log_time)
         return writer.path
 
 
@@ -54,16 +54,16 @@ def test_a_recorded_session_holds_the_messages_as_they_came_and_the_pose(tmp_pat
     assert_on_the_table(session.trials)
     raw = read_session(record(tmp_path / 'raw', seen)).trials
     assert np.allclose(raw[0].initial.points, seen[0].initial.points)
-    found, _ = session_manipulations(session, session.options)
-    assert np.allclose(found[0].start.points, toy_trials(1)[0].initial.points, atol=1e-12)
+    manipulations, _ = session_manipulations(session, session.options)
+    assert np.allclose(manipulations[0].start.points, toy_trials(1)[0].initial.points, atol=1e-12)
 
 
 def test_frame_pose_of_a_request_and_of_the_flag(tmp_path, seen, command):
-    request = Request(tuple(map(TrialRequest.of, seen)), {'frame_pose': TEXT})
-    trials, _ = request_trials(request, Options.of(request.options))
+    request = Request(tuple(map(TrialRequest.of, seen)), FileOptions({'frame_pose': TEXT}))
+    trials, _ = request_trials(request, request.file_options.options())
     assert_on_the_table(trials)
-    found = request_manipulations(request, Options.of(request.options))
-    assert np.allclose(found[1].start.points, toy_trials(2)[1].initial.points, atol=1e-12)
+    manipulations = request_manipulations(request, request.file_options.options())
+    assert np.allclose(manipulations[1].start.points, toy_trials(2)[1].initial.points, atol=1e-12)
     write_request(tmp_path / 'request.xml', Request(request.trials))
     _, wrong, _ = command('info', tmp_path / 'request.xml', '--json')
     assert 'a DLO' in wrong['problems'][0]
@@ -90,9 +90,9 @@ def test_a_named_action_is_done_in_the_frame_of_the_table(action):
     assert refusals == ()
     for hand, right in zip(trial.hands, level.trial().hands, strict=True):
         assert np.allclose(hand.positions, right.positions, atol=1e-12)
-    found, = request_manipulations(tilted, Options(frame_pose=TEXT))
+    placed, = request_manipulations(tilted, Options(frame_pose=TEXT))
     right = level.manipulation()
-    path, = (step.actions[0].action(right.start) for step in found.steps)
+    path, = (step.actions[0].action(right.start) for step in placed.steps)
     assert np.allclose(path.hands[0].positions, trial.hands[0].positions)
 
 

@@ -19,7 +19,7 @@ from toy_messages import toy_trials
 from toy_simulator import new_toy, ToySimulator
 
 from dlo_calibration import calibrate
-from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.options import FileOptions, Options
 from dlo_calibration.cli import main as cli
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.chain_file import chain_xml, read_chain_file
@@ -58,20 +58,21 @@ PATHS = Action((Hand('left_hand', (0, 1), np.array([1.0, 2.0]), np.array([[0, 0,
 OPTIONS = {'mass': 0.1 + 0.2, 'calibrate': ['friction', 'flexibility'], 'damping': 1 / 3, 'table': False}
 
 
-def request(*actions, goals=None, **rest):
+def request(*actions, goals=None, options=()):
     goals = goals or (GoalRequest(RAISED, 60.0),)
-    return Request((TrialRequest('trial 1', INITIAL, actions or (PATHS,), goals),), **rest)
+    trial = TrialRequest('trial 1', INITIAL, actions or (PATHS,), goals)
+    return Request((trial,), FileOptions(dict(options)))
 
 
-def returned(one):
+def returned(given):
     """Return a request after a journey through a document, which must stay the same."""
-    found = request_of(one.document)
-    assert found.document == one.document
-    return found
+    request_read = request_of(given.document)
+    assert request_read.document == given.document
+    return request_read
 
 
-def same_trials(one, other):
-    for a, b in zip(one, other, strict=True):
+def same_trials(first, second):
+    for a, b in zip(first, second, strict=True):
         assert a.name == b.name
         for x, y in zip([a.initial, *(goal.chain for goal in a.goals)],
                         [b.initial, *(goal.chain for goal in b.goals)], strict=True):
@@ -146,28 +147,28 @@ def test_any_request_comes_back_exactly(initial, goal, several, name, of_object,
                              None if velocity is None else [velocity] * 4)
     except InputError:  # times so near to each other that they are the same number, ...
         reject()
-    given_request = Request((trial, trial), {} if mass is None else {'mass': mass}, of_object)
-    found = returned(given_request)
-    assert (found.name, dict(found.options)) == (of_object, dict(given_request.options))
-    assert [one for one in found.trials[0].actions if not isinstance(one, Action)] == [
-        one for one in several if not isinstance(one, Action)]
-    assert same_trials([one.trial() for one in found.trials], [trial.trial()] * 2)
+    given_request = Request((trial, trial), FileOptions({} if mass is None else {'mass': mass}), of_object)
+    again = returned(given_request)
+    assert (again.name, again.file_options) == (of_object, given_request.file_options)
+    assert [action for action in again.trials[0].actions if not isinstance(action, Action)] == [
+        action for action in several if not isinstance(action, Action)]
+    assert same_trials([requested.trial() for requested in again.trials], [trial.trial()] * 2)
 
 
 def test_options_come_back_as_the_calibrator_takes_them():
-    found = returned(request(options=OPTIONS))
-    assert dict(found.options) == OPTIONS
-    assert Options.of(found.options) == Options.of(OPTIONS)
+    again = returned(request(options=OPTIONS))
+    assert dict(again.file_options.values) == OPTIONS
+    assert again.file_options.options() == Options.of(OPTIONS)
 
 
 def test_all_options_come_back():
-    assert Options.of(returned(request(options=Options().flat())).options) == Options()
+    assert returned(request(options=Options().flat())).file_options.options() == Options()
 
 
 def test_trials_of_a_session_make_a_request():
     trials = toy_trials(3)
-    found = returned(Request(tuple(TrialRequest.of(trial) for trial in trials)))
-    assert same_trials(request_trials(found, Options())[0], trials)
+    again = returned(Request(tuple(TrialRequest.of(trial) for trial in trials)))
+    assert same_trials(request_trials(again, Options())[0], trials)
 
 
 def test_action_is_done_on_the_latest_chain_before_it():
@@ -193,9 +194,9 @@ def test_option_release_counts_for_explicit_paths(release, held_by):
 
 
 def test_goal_of_another_length_is_refused_and_the_other_trials_stay():
-    one = request().trials[0]
-    long = replace(one, name='long', goals=(GoalRequest(Chain(INITIAL.points * 2), 60.0),))
-    trials, refusals = request_trials(Request((one, long)), Options())
+    observed = request().trials[0]
+    long = replace(observed, name='long', goals=(GoalRequest(Chain(INITIAL.points * 2), 60.0),))
+    trials, refusals = request_trials(Request((observed, long)), Options())
     assert [trial.name for trial in trials] == ['trial 1']
     assert re.search("'long'.*100 %.*length_tolerance", refusals[0])
 
@@ -305,24 +306,24 @@ def file(tmp_path):
     """Give the path of a request with the toy's trials."""
     path = tmp_path / 'asked.xml'
     write_request(path, Request(tuple(TrialRequest.of(trial) for trial in toy_trials(2)),
-                                {'evaluations': 20, 'mass': 0.2}))
+                                FileOptions({'evaluations': 20, 'mass': 0.2})))
     return path
 
 
 def test_fit_of_a_request_gives_what_the_library_gives(command, file):
     code, output, _ = command('fit', file, '--json')
-    found = json.loads(output)
+    printed = json.loads(output)
     result = calibrate(toy_trials(2), Options.of({'evaluations': 20, 'mass': 0.2}), make_simulator=new_toy)
     assert code == 0
-    assert {name: one['value'] for name, one in found['parameters'].items()} == result.values
-    assert (found['trials'], found['evaluations'], found['score']) == (2, 20, result.best.score)
+    assert {name: estimate['value'] for name, estimate in printed['parameters'].items()} == result.values
+    assert (printed['trials'], printed['evaluations'], printed['score']) == (2, 20, result.best.score)
 
 
 def test_fit_of_a_request_writes_its_files_and_validate_takes_it(command, file, tmp_path):
     code, output, errors = command('fit', file, '--json', '--evaluations', 5, '--output', tmp_path / 'out')
     assert code == 0
     assert 'evaluations: 5 instead of 20' in errors
-    assert {one.name for one in (tmp_path / 'out').iterdir()} == {
+    assert {file.name for file in (tmp_path / 'out').iterdir()} == {
         'result.xml', 'request.xml', 'session.mcap', 'report.html', 'evaluations.csv'}
     assert (tmp_path / 'out' / 'request.xml').read_bytes() == file.read_bytes()
     assert read_result(tmp_path / 'out' / 'result.xml').mass == 0.2
@@ -337,9 +338,9 @@ def test_fit_of_a_request_writes_its_files_and_validate_takes_it(command, file, 
 
 def test_info_says_what_is_in_a_request(command, file):
     code, output, _ = command('info', file, '--json')
-    found = json.loads(output)
-    assert (code, [trial['name'] for trial in found['trials']]) == (0, ['trial 1', 'trial 2'])
-    assert found['options'] == {'evaluations': 20, 'mass': 0.2}
+    printed = json.loads(output)
+    assert (code, [trial['name'] for trial in printed['trials']]) == (0, ['trial 1', 'trial 2'])
+    assert printed['options'] == {'evaluations': 20, 'mass': 0.2}
     assert command('info', file)[0] == 0
 
 
@@ -355,8 +356,8 @@ def test_examples_of_the_document_are_what_it_says(tmp_path):
     text = (SAMPLES.parents[1] / 'doc' / 'formats.md').read_text(encoding='utf-8')
     described, asked, to_simulate, chain = re.findall('```xml\n(.*?)```', text, re.DOTALL)
     assert read_description(described).parameters['flexibility'].identifiable
-    found = request_of(asked.encode())
-    assert {action.name for trial in found.trials for action in trial.actions} == {
+    request_read = request_of(asked.encode())
+    assert {action.name for trial in request_read.trials for action in trial.actions} == {
         'lift_and_hold', 'release', 'hand_paths'}
     only, = request_of(to_simulate.encode()).trials
     assert [step.name for step in only.manipulation().steps] == [
@@ -375,10 +376,10 @@ def test_samples_use_every_named_action_and_both_ways():
 
 @pytest.mark.parametrize('file', REQUESTS, ids=lambda file: file.name)
 def test_sample_is_written_as_this_package_writes(file):
-    found = read_request(file)
-    assert found.document == file.read_bytes()
-    trials, refusals = request_trials(found, Options.of(found.options))
-    assert len(trials) == len(found.trials) and refusals == ()
+    request_read = read_request(file)
+    assert request_read.document == file.read_bytes()
+    trials, refusals = request_trials(request_read, request_read.file_options.options())
+    assert len(trials) == len(request_read.trials) and refusals == ()
 
 
 def test_script_writes_the_requests():
@@ -397,15 +398,15 @@ def test_other_samples_are_descriptions():
 @pytest.mark.parametrize('file', REQUESTS, ids=lambda file: file.name)
 def test_sample_is_explained_by_its_parameters(file, capsys):
     code = cli.main(['validate', str(SAMPLES / 'dlo.xml'), str(file), '--json', '--workers', '1'])
-    found = json.loads(capsys.readouterr().out)
+    printed = json.loads(capsys.readouterr().out)
     assert code == 0
-    assert found['error_percent_of_length'] < 2
+    assert printed['error_percent_of_length'] < 2
 
 
 @pytest.mark.long
 def test_sample_is_fitted(capsys):
     code = cli.main(['fit', str(SAMPLES / 'named_actions.xml'), '--json', '--evaluations', '3',
                      '--engine', 'compiled', '--workers', '1'])
-    found = json.loads(capsys.readouterr().out)
-    assert (code, found['trials'], found['evaluations']) == (0, 4, 3)
-    assert found['score'] < 100
+    printed = json.loads(capsys.readouterr().out)
+    assert (code, printed['trials'], printed['evaluations']) == (0, 4, 3)
+    assert printed['score'] < 100

@@ -62,43 +62,44 @@ def refused(path, match):
 def test_same_physical_values_bit_for_bit(tmp_path, seed, mass):
     result = calibrated(seed, mass)
     write_result(tmp_path / 'result.xml', result)
-    found = read_result(tmp_path / 'result.xml')
-    assert found.values == result.values
-    assert found.physical() == result.physical()
-    assert (found.space.free, found.space.mass) == (result.space.free, result.space.mass)
+    description = read_result(tmp_path / 'result.xml')
+    assert description.values == result.values
+    assert description.physical() == result.physical()
+    assert (description.space.free, description.space.mass) == (result.space.free, result.space.mass)
 
 
 def test_value_of_a_found_parameter_in_the_options_does_not_count(tmp_path):
     space = Options.of({'calibrate': ['friction'], 'friction': 12.0, 'damping': 80.0}).space
     result = fitted([toy_trial(TRUTH)], space, ToySimulator(), RandomSearch(1, 1), budget=3)
     write_result(tmp_path / 'result.xml', result)
-    found = read_result(tmp_path / 'result.xml')
-    assert found.physical() == result.physical()
-    assert 'friction' not in found.fixed and found.fixed['damping'] == 80.0
+    description = read_result(tmp_path / 'result.xml')
+    assert description.physical() == result.physical()
+    assert 'friction' not in description.fixed and description.fixed['damping'] == 80.0
 
 
 def test_same_simulation_bit_for_bit(file, result):
-    found = read_result(file)
+    description = read_result(file)
     for goals, trial in zip(result.chains, result.trials, strict=True):
-        rollout = ToySimulator().simulate(trial, found.physical())
+        rollout = ToySimulator().simulate(trial, description.physical())
         np.testing.assert_allclose(rollout.chains, goals, atol=1e-12)
         first = ToySimulator().simulate(trial, result.physical())
         np.testing.assert_array_equal(rollout.chains, first.chains)
 
 
 def test_everything_else_comes_back(file, result):
-    found = read_result(file)
-    assert {name: asdict(p) for name, p in found.parameters.items()} == {
+    description = read_result(file)
+    assert {name: asdict(p) for name, p in description.parameters.items()} == {
         name: asdict(p) for name, p in result.parameters.items()}
-    assert list(found.parameters) == ['friction', 'flexibility']
-    assert (found.score, found.scores, found.errors) == (result.best.score, result.best.scores, result.errors)
-    assert (found.search, found.engine, found.seed) == ('random', 'toy', 1)
-    assert (found.evaluations, found.simulations, found.stop_reason, found.seconds) == (
-        20, result.simulations, result.stop_reason, result.seconds)
-    assert (found.trials, found.warnings) == (('trial 1', 'trial 2'), result.warnings)
-    np.testing.assert_array_equal(found.chain.points, result.trials[0].initial.points)
-    assert found.chain.hands is None and not found.chain.features.any()
-    assert Options.of(found.options) == OPTIONS
+    assert list(description.parameters) == ['friction', 'flexibility']
+    assert (description.score, description.scores) == (result.best.score, result.best.scores)
+    assert description.errors == result.errors
+    assert (description.search, description.engine, description.seed) == ('random', 'toy', 1)
+    assert (description.evaluations, description.simulations) == (20, result.simulations)
+    assert (description.stop_reason, description.seconds) == (result.stop_reason, result.seconds)
+    assert (description.trials, description.warnings) == (('trial 1', 'trial 2'), result.warnings)
+    np.testing.assert_array_equal(description.chain.points, result.trials[0].initial.points)
+    assert description.chain.hands is None and not description.chain.features.any()
+    assert description.file_options.options() == OPTIONS
 
 
 def test_writing_what_was_read_gives_the_same_bytes(file):
@@ -113,10 +114,10 @@ def test_a_document_from_before_there_were_verdicts_stays_as_it_is(file):
 
 
 def test_correlations_come_back(file, result):
-    found = read_result(file).correlations
-    assert found == result.correlations
-    assert found['friction']['flexibility'] == found['flexibility']['friction'] != 0
-    assert found['friction']['friction'] == 1
+    description = read_result(file).correlations
+    assert description == result.correlations
+    assert description['friction']['flexibility'] == description['flexibility']['friction'] != 0
+    assert description['friction']['friction'] == 1
 
 
 def test_a_document_from_before_there_were_correlations_stays_as_it_is(file):
@@ -142,12 +143,12 @@ def test_document_is_for_people_too(file):
 def test_a_result_that_should_not_be_used_says_so_wherever_it_is_read(tmp_path, result):
     doubted = replace(result, implausible=('trial 1: a DLO on the Moon',))
     write_result(tmp_path / 'doubted.xml', doubted, OPTIONS.flat())
-    found = read_result(tmp_path / 'doubted.xml')
-    assert found.unusable == doubted.unusable == doubted.implausible[0]
-    assert found.problems == (f'do not use this result: {doubted.implausible[0]}',)
+    description = read_result(tmp_path / 'doubted.xml')
+    assert description.unusable == doubted.unusable == doubted.implausible[0]
+    assert description.file_options.warnings == (f'do not use this result: {doubted.implausible[0]}',)
     sound = Description.of(replace(result, choice=None))
     assert sound.unusable == ''
-    assert read_description(description_document(sound)).problems == ()
+    assert read_description(description_document(sound)).file_options.warnings == ()
 
 
 @drawing(20)
@@ -158,12 +159,12 @@ def test_any_text_and_number_survives(tmp_path_factory, result, text, value, len
     given_file = replace(Description.of(result), parameters={'flexibility': flexibility}, length=length,
                          stop_reason=text, warnings=(text,))
     write_result(path, given_file)
-    found = read_result(path)
-    assert (found.values, found.length) == ({'flexibility': value}, length)
+    description = read_result(path)
+    assert (description.values, description.length) == ({'flexibility': value}, length)
     printable = ''.join(c if c in '\t\n\r' or ' ' <= c < '\ufffe' or c > '\uffff' else '\ufffd' for c in text)
     printable = re.sub('[\ud800-\udfff]', '\ufffd', printable)
-    assert found.stop_reason == found.parameters['flexibility'].physical_unit == printable
-    assert found.warnings == (printable,)
+    assert description.stop_reason == description.parameters['flexibility'].physical_unit == printable
+    assert description.warnings == (printable,)
 
 
 @pytest.mark.parametrize('change, match', [
@@ -242,9 +243,9 @@ def test_hand_written_description_keeps_its_annotations(result):
     hands = np.zeros(11, np.uint8)
     hands[[0, 1]] = 2
     chain = Chain(result.trials[0].initial.points, hands, np.arange(11) == 4)
-    found = read_description(description_document(replace(Description.of(result), chain=chain)))
-    np.testing.assert_array_equal(found.chain.hands, hands)
-    np.testing.assert_array_equal(np.flatnonzero(found.chain.features), [4])
+    description = read_description(description_document(replace(Description.of(result), chain=chain)))
+    np.testing.assert_array_equal(description.chain.hands, hands)
+    np.testing.assert_array_equal(np.flatnonzero(description.chain.features), [4])
 
 
 def test_text_of_a_message_is_read_too(result):
@@ -255,9 +256,9 @@ def test_text_of_a_message_is_read_too(result):
 
 
 def test_fixed_values_are_complete_and_in_units(result):
-    found = read_description(description_document(result))
-    names = {one.name for one in ParameterSpace().parameters}
-    assert set(found.fixed) | set(found.values) == names - {'mass'}
+    description = read_description(description_document(result))
+    names = {parameter.name for parameter in ParameterSpace().parameters}
+    assert set(description.fixed) | set(description.values) == names - {'mass'}
     element = etree.fromstring(description_document(result)).find('.//fixed[@name="elasticity"]')
     assert element.get('physical_unit') == 'N'
     assert float(element.get('physical_value')) == pytest.approx(result.physical()['elasticity'])

@@ -64,7 +64,7 @@ def filled(types, name, values):
         if node == Nodetype.SEQUENCE:
             element, _ = rest
             return types.octets(bytes(given)) if element == (Nodetype.BASE, ('uint8', 0)) else \
-                [value(element, one) for one in given]
+                [value(element, item) for item in given]
         return given
 
     fields = dict(FIELDS[name][1])
@@ -89,23 +89,23 @@ def sample_trials(messages):
 
 
 def test_every_file_is_used():
-    known = {SAMPLES / 'README.md', *SAMPLES.glob('make_*.py'), *SAMPLES.glob('xml/*.xml')}
-    known |= {SAMPLES / 'photographs' / name
-              for name in ('README.md', 'truth.json', 'first.jpg', 'second.jpg', 'third.jpg')}
-    known |= {SAMPLES / 'chains' / name for name in ('start.csv', 'goal.csv')}
-    assert files(SAMPLES) == known | {message_file(kind) for kind in INPUT_TYPES} | files(*SESSIONS)
+    listed = {SAMPLES / 'README.md', *SAMPLES.glob('make_*.py'), *SAMPLES.glob('xml/*.xml')}
+    listed |= {SAMPLES / 'photographs' / name
+               for name in ('README.md', 'truth.json', 'first.jpg', 'second.jpg', 'third.jpg')}
+    listed |= {SAMPLES / 'chains' / name for name in ('start.csv', 'goal.csv', 'hairpin.csv')}
+    assert files(SAMPLES) == listed | {message_file(kind) for kind in INPUT_TYPES} | files(*SESSIONS)
     readme = (SAMPLES / 'README.md').read_text(encoding='utf-8')
-    for name in ('make_yaml.py', *(f'{kind}.yaml' for kind in INPUT_TYPES), *(one.name for one in SESSIONS),
-                 'photographs', 'chains'):
+    for name in ('make_yaml.py', *(f'{kind}.yaml' for kind in INPUT_TYPES),
+                 *(session.name for session in SESSIONS), 'photographs', 'chains'):
         assert name in readme
 
 
 def test_the_chains_are_a_start_and_a_goal_for_the_dlo_of_the_description():
-    found = read_result(SAMPLES / 'xml' / 'dlo.xml')
+    description = read_result(SAMPLES / 'xml' / 'dlo.xml')
     start, goal = (read_chain_file(SAMPLES / 'chains' / name) for name in ('start.csv', 'goal.csv'))
-    assert checked(found, start, goal, found.file_options.options(), PlanOptions())[0] is start
-    assert start.length == pytest.approx(found.length, rel=0.01)
-    assert goal.length == pytest.approx(found.length, rel=0.01)
+    assert checked(description, start, goal, description.file_options.options(), PlanOptions())[0] is start
+    assert start.length == pytest.approx(description.length, rel=0.01)
+    assert goal.length == pytest.approx(description.length, rel=0.01)
 
 
 @pytest.mark.parametrize('load', [loaded_by_ruamel, loaded_by_pyyaml])
@@ -120,15 +120,16 @@ def test_yaml_messages_in_any_order_are_one_complete_trial(types, load):
 def test_yaml_messages_show_the_first_trial_of_object1(types):
     whole = read_session(SAMPLES / 'object1').messages[:len(INPUT_TYPES)]
     for (kind, message), (expected_kind, expected) in zip(sample_messages(types), whole, strict=True):
-        one, other = read(kind, message), read(expected_kind, expected)
-        assert (one.kind, one.stamp, one.frame_id) == (other.kind, other.stamp, other.frame_id)
+        sample, original = read(kind, message), read(expected_kind, expected)
+        assert (sample.kind, sample.stamp, sample.frame_id) == (
+            original.kind, original.stamp, original.frame_id)
         if kind == ACTION:
-            np.testing.assert_array_equal(one.times, other.times)
-            found, wanted = one.positions, other.positions
+            np.testing.assert_array_equal(sample.times, original.times)
+            actual, wanted = sample.positions, original.positions
         else:
-            np.testing.assert_array_equal(one.chain.hands, other.chain.hands[::2])
-            found, wanted = one.chain.points, other.chain.points[::2]
-        np.testing.assert_allclose(found, wanted, rtol=0, atol=0.501e-4)
+            np.testing.assert_array_equal(sample.chain.hands, original.chain.hands[::2])
+            actual, wanted = sample.chain.points, original.chain.points[::2]
+        np.testing.assert_allclose(actual, wanted, rtol=0, atol=0.501e-4)
 
 
 def test_yaml_messages_calibrate():
@@ -161,7 +162,7 @@ def test_script_writes_the_yaml_files(tmp_path):
 @pytest.mark.parametrize('folder', SESSIONS, ids=lambda folder: folder.name)
 def test_session_is_complete(folder, capsys):
     assert cli.main(['info', str(folder), '--json']) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert len(found['trials']) == 4
-    assert found['messages'] == {f'/calibrator/{kind}': 4 for kind in INPUT_TYPES}
-    assert (found['problems'], found['refusals']) == ([], [])
+    printed = json.loads(capsys.readouterr().out)
+    assert len(printed['trials']) == 4
+    assert printed['messages'] == {f'/calibrator/{kind}': 4 for kind in INPUT_TYPES}
+    assert (printed['problems'], printed['refusals']) == ([], [])

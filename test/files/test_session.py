@@ -82,9 +82,9 @@ def content(messages):
     """Return what messages say, comparable; never their bytes, whose padding is arbitrary."""
     said = []
     for kind, message in messages:
-        one = read(kind, message)
-        arrays = (one.times, one.positions) if kind == ACTION else (one.chain.points,)
-        said.append((kind, one.stamp, [array.tolist() for array in arrays]))
+        decoded = read(kind, message)
+        arrays = (decoded.times, decoded.positions) if kind == ACTION else (decoded.chain.points,)
+        said.append((kind, decoded.stamp, [array.tolist() for array in arrays]))
     return said
 
 
@@ -112,13 +112,14 @@ def mcap(folder):
 @pytest.mark.parametrize('what', ['folder', 'file'])
 def test_rosbags_reads_what_we_write(session, what):
     with Reader(session if what == 'folder' else mcap(session)) as reader:
-        found = list(reader.messages())
+        messages = list(reader.messages())
         assert {(c.topic, c.msgtype, c.msgcount) for c in reader.connections} == {
             *((f'/calibrator/{kind}', name, 3) for kind, name in INPUT_TYPES.items()),
             ('/calibrator/status', STATUS, 1)}
         assert (reader.start_time, reader.message_count) == (START, 10)
-    assert [time for _, time, _ in found[:-1]] == [time for _, _, time in MESSAGES]
-    decoded = [(c.topic.rsplit('/')[-1], STORE.deserialize_cdr(raw, c.msgtype)) for c, _, raw in found[:-1]]
+    assert [time for _, time, _ in messages[:-1]] == [time for _, _, time in MESSAGES]
+    decoded = [(c.topic.rsplit('/')[-1], STORE.deserialize_cdr(raw, c.msgtype))
+               for c, _, raw in messages[:-1]]
     assert content(decoded) == EXPECTED
 
 
@@ -129,13 +130,13 @@ def test_late_subscribers_get_the_status_when_a_session_is_played(session):
     assert durability['/calibrator/action'] == 'VOLATILE'
 
 
-def test_mcap_file_says_what_rosbag2_writes(session):
+def test_mcap_file_has_the_profile_schemas_and_metadata_of_rosbag2(session):
     about = YAML(typ='safe').load((session / 'metadata.yaml').read_text())['rosbag2_bagfile_information']
     with mcap(session).open('rb') as stream:
         reader = make_reader(stream, validate_crcs=True)
         summary = reader.get_summary()
         assert reader.get_header().profile == 'ros2'
-        inside = {one.name: one.metadata for one in reader.iter_metadata()}
+        inside = {record.name: record.metadata for record in reader.iter_metadata()}
     assert {(s.name, s.encoding) for s in summary.schemas.values()} == {
         (name, 'ros2msg') for name in (*INPUT_TYPES.values(), STATUS)}
     for channel in summary.channels.values():
@@ -148,9 +149,9 @@ def test_mcap_file_says_what_rosbag2_writes(session):
 
 def test_mcap_ros2_reads_what_we_write(session):
     read_ros2_messages = pytest.importorskip('mcap_ros2.reader').read_ros2_messages
-    found = [(m.channel.topic.rsplit('/')[-1], m.ros_msg) for m in read_ros2_messages(str(mcap(session)))]
-    assert content(found[:-1]) == EXPECTED
-    assert found[-1][1].status[0].name == 'status'
+    messages = [(m.channel.topic.rsplit('/')[-1], m.ros_msg) for m in read_ros2_messages(str(mcap(session)))]
+    assert content(messages[:-1]) == EXPECTED
+    assert messages[-1][1].status[0].name == 'status'
 
 
 # What we read
@@ -158,11 +159,11 @@ def test_mcap_ros2_reads_what_we_write(session):
 
 @pytest.mark.parametrize('what', ['folder', 'file'])
 def test_own_session_round_trip(session, what):
-    found = read_session(session if what == 'folder' else mcap(session))
-    assert content(found.messages) == EXPECTED
-    assert found.recorded == {'mass': 0.03}
-    assert found.problems == ()
-    assert [one.status[0].name for one in found.outputs('status')] == ['status']
+    recorded = read_session(session if what == 'folder' else mcap(session))
+    assert content(recorded.messages) == EXPECTED
+    assert recorded.file_options.values == {'mass': 0.03}
+    assert recorded.warnings == ()
+    assert [message.status[0].name for message in recorded.outputs('status')] == ['status']
 
 
 @pytest.mark.parametrize('storage', StoragePlugin)
@@ -176,9 +177,9 @@ def test_bag_by_rosbags(tmp_path, storage, mode, version):
                   for kind, name in INPUT_TYPES.items()}
         for kind, message, log_time in MESSAGES:
             writer.write(topics[kind], log_time, encode(message, INPUT_TYPES[kind]))
-    found = read_session(tmp_path / 'bag')
-    assert content(found.messages) == EXPECTED
-    assert found.recorded is None and found.problems == ()
+    recorded = read_session(tmp_path / 'bag')
+    assert content(recorded.messages) == EXPECTED
+    assert recorded.file_options is None and recorded.warnings == ()
 
 
 def test_db3_file_without_its_folder(tmp_path):
@@ -206,10 +207,10 @@ def test_file_by_mcap(tmp_path, chunked, short):
         for kind, message, log_time in MESSAGES:
             writer.add_message(channels[kind], log_time, encode(message, INPUT_TYPES[kind]), log_time)
         writer.finish()
-    found = read_session(path)
-    assert content(found.messages) == EXPECTED
-    problem, = found.problems
-    assert '/camera/goal_chain' in problem and 'json' in problem
+    recorded = read_session(path)
+    assert content(recorded.messages) == EXPECTED
+    warning, = recorded.warnings
+    assert '/camera/goal_chain' in warning and 'json' in warning
 
 
 def test_bag_that_was_split(tmp_path, session):
@@ -220,10 +221,10 @@ def test_bag_that_was_split(tmp_path, session):
             write(writer, messages)
     (folder / 'metadata.yaml').write_text(json.dumps({'rosbag2_bagfile_information': {
         'relative_file_paths': ['bag_0.mcap', 'bag_1.mcap', 'bag_2.mcap']}}))
-    found = read_session(folder)
-    assert content(found.messages) == EXPECTED
-    problem, = found.problems
-    assert 'bag_2.mcap' in problem
+    recorded = read_session(folder)
+    assert content(recorded.messages) == EXPECTED
+    warning, = recorded.warnings
+    assert 'bag_2.mcap' in warning
 
 
 def test_messages_come_in_log_order(tmp_path):
@@ -237,10 +238,10 @@ def test_folder_whose_metadata_file_is_damaged(tmp_path, session, text):
     folder = tmp_path / 'copy'
     shutil.copytree(session, folder)
     (folder / 'metadata.yaml').write_text(text)
-    found = read_session(folder)
-    assert content(found.messages) == EXPECTED
-    problem, = found.problems
-    assert 'metadata.yaml' in problem
+    recorded = read_session(folder)
+    assert content(recorded.messages) == EXPECTED
+    warning, = recorded.warnings
+    assert 'metadata.yaml' in warning
 
 
 def test_undecodable_message_is_left_out_alone(tmp_path):
@@ -248,10 +249,10 @@ def test_undecodable_message_is_left_out_alone(tmp_path):
         write(writer, MESSAGES[:2])
         writer.write('/calibrator/goal_chain', INPUT_TYPES[GOAL], b'\0\1\0\0\xff\xff', START + 2 * SECOND)
         write(writer, MESSAGES[2:])
-    found = read_session(writer.path)
-    assert content(found.messages) == EXPECTED
-    problem, = found.problems
-    assert 'goal_chain' in problem
+    recorded = read_session(writer.path)
+    assert content(recorded.messages) == EXPECTED
+    warning, = recorded.warnings
+    assert 'goal_chain' in warning
 
 
 # Broken files
@@ -293,12 +294,12 @@ def whole_file(request, tmp_path_factory):
 def read_or_refuse(path):
     """Read a session; None where it is refused as it should be."""
     try:
-        found = read_session(path)
+        recorded = read_session(path)
     except InputError as error:
         assert str(path) in str(error) and '\n' not in str(error)
         return None
-    session_trials(found, Options())
-    return found
+    session_trials(recorded, Options())
+    return recorded
 
 
 @drawing(15)
@@ -307,11 +308,11 @@ def test_cut_anywhere_gives_the_messages_before_the_cut(whole_file, tmp_path_fac
     octets, suffix = whole_file
     path = tmp_path_factory.mktemp('cut') / f'cut{suffix}'
     path.write_bytes(octets[:int(place * (len(octets) - 1))])
-    found = read_or_refuse(path)
-    if found is not None:
-        said = content(found.messages)
+    recorded = read_or_refuse(path)
+    if recorded is not None:
+        said = content(recorded.messages)
         assert said == EXPECTED[:len(said)]
-        assert len(said) == len(EXPECTED) or found.problems
+        assert len(said) == len(EXPECTED) or recorded.warnings
 
 
 @drawing(15)
@@ -341,11 +342,11 @@ def test_cut_session_says_so(tmp_path, session):
     with file.open('rb') as stream:
         sixth = make_reader(stream).get_summary().chunk_indexes[5]
     os.truncate(file, sixth.chunk_start_offset + sixth.chunk_length // 2)
-    found = read_session(folder)
-    assert content(found.messages) == EXPECTED[:5]
-    assert found.recorded == {'mass': 0.03}
-    problem, = found.problems
-    assert 'cut' in problem and file.name in problem
+    recorded = read_session(folder)
+    assert content(recorded.messages) == EXPECTED[:5]
+    assert recorded.file_options.values == {'mass': 0.03}
+    warning, = recorded.warnings
+    assert 'cut' in warning and file.name in warning
 
 
 @pytest.mark.parametrize('make', [
@@ -373,7 +374,7 @@ def test_recording_of_something_else_is_refused_with_what_it_holds(tmp_path):
 # Namespaces
 
 
-def test_any_namespace_is_found(tmp_path):
+def test_topics_of_any_namespace_are_read(tmp_path):
     for namespace in ('', '/a/deep/one'):
         with SessionWriter(tmp_path / 'session') as writer:
             write(writer, namespace=namespace)
@@ -382,8 +383,8 @@ def test_any_namespace_is_found(tmp_path):
 
 def test_each_kind_may_come_from_another_namespace(tmp_path):
     with SessionWriter(tmp_path / 'session') as writer:
-        for one in MESSAGES:
-            write(writer, [one], '/robot' if one[0] == ACTION else '/tracker')
+        for pair in MESSAGES:
+            write(writer, [pair], '/robot' if pair[0] == ACTION else '/tracker')
     assert content(read_session(writer.path).messages) == EXPECTED
 
 
@@ -403,10 +404,10 @@ def test_namespace_that_has_all_topics_is_preferred(tmp_path):
     with SessionWriter(tmp_path / 'session') as writer:
         write(writer)
         write(writer, MESSAGES[:1], '/second_camera')
-    found = read_session(writer.path)
-    assert content(found.messages) == EXPECTED
-    problem, = found.problems
-    assert '/calibrator' in problem
+    recorded = read_session(writer.path)
+    assert content(recorded.messages) == EXPECTED
+    warning, = recorded.warnings
+    assert '/calibrator' in warning
 
 
 def test_topic_of_another_type_is_left_out_and_named(tmp_path):
@@ -414,10 +415,10 @@ def test_topic_of_another_type_is_left_out_and_named(tmp_path):
         write(writer)
         message = TYPES.build('std_msgs/msg/String', data='grasp')
         writer.write('/planner/action', 'std_msgs/msg/String', encode(message, 'std_msgs/msg/String'), START)
-    found = read_session(writer.path)
-    assert content(found.messages) == EXPECTED
-    problem, = found.problems
-    assert '/planner/action' in problem and 'std_msgs/msg/String' in problem
+    recorded = read_session(writer.path)
+    assert content(recorded.messages) == EXPECTED
+    warning, = recorded.warnings
+    assert '/planner/action' in warning and 'std_msgs/msg/String' in warning
 
 
 # Options and marks
@@ -438,10 +439,10 @@ def test_a_replay_uses_the_messages_of_the_calibration(tmp_path):
         write(writer, MESSAGES[3:6])
         writer.write_mark('start')
         write(writer, MESSAGES[6:])
-    found = read_session(writer.path)
-    assert content(found.messages) == EXPECTED[3:6]
-    problem, = found.problems
-    assert '6 message(s)' in problem
+    recorded = read_session(writer.path)
+    assert content(recorded.messages) == EXPECTED[3:6]
+    warning, = recorded.warnings
+    assert '6 message(s)' in warning
 
 
 def test_reset_after_a_calibration_begins_anew(tmp_path):
@@ -453,7 +454,7 @@ def test_reset_after_a_calibration_begins_anew(tmp_path):
     assert content(read_session(writer.path).messages) == EXPECTED[3:]
 
 
-def test_reset_at_the_end_leaves_what_was_calibrated(tmp_path):
+def test_a_reset_at_the_end_leaves_the_calibrated_trials(tmp_path):
     with SessionWriter(tmp_path / 'session') as writer:
         write(writer, MESSAGES[:3])
         writer.write_mark('start')
@@ -484,17 +485,17 @@ from pathlib import Path
 from dlo_calibration.files.recording import SessionWriter
 from dlo_calibration.files.session import read_session
 source = read_session({str(session)!r})
-writer = SessionWriter(Path({str(tmp_path)!r}) / 'killed', source.recorded)
+writer = SessionWriter(Path({str(tmp_path)!r}) / 'killed', source.file_options.values)
 for record in source.records:
     writer.write(record.topic, record.type, record.data, record.log_time)
 os.kill(os.getpid(), signal.SIGKILL)
 """
     done = subprocess.run([sys.executable, '-c', program], cwd=SAMPLES.parent)
     assert done.returncode == -signal.SIGKILL
-    found = read_session(tmp_path / 'killed')
-    assert content(found.messages) == EXPECTED
-    assert found.recorded == {'mass': 0.03}
-    assert len(found.problems) == 1
+    recorded = read_session(tmp_path / 'killed')
+    assert content(recorded.messages) == EXPECTED
+    assert recorded.file_options.values == {'mass': 0.03}
+    assert len(recorded.warnings) == 1
 
 
 def test_place_that_cannot_be_written(tmp_path):
@@ -516,9 +517,9 @@ def test_full_disk_is_one_kind_of_error_and_what_was_written_stays(tmp_path):
         writer.close()
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    found = read_session(writer.path)
-    assert content(found.messages) == EXPECTED[:3]
-    assert found.problems
+    recorded = read_session(writer.path)
+    assert content(recorded.messages) == EXPECTED[:3]
+    assert recorded.warnings
 
 
 def test_a_session_that_cannot_begin_leaves_nothing(tmp_path):
@@ -539,7 +540,7 @@ def test_closing_twice_is_harmless(tmp_path):
     write(writer)
     writer.close()
     writer.close()
-    assert read_session(writer.path).problems == ()
+    assert read_session(writer.path).warnings == ()
 
 
 def test_writing_after_closing_is_a_recording_error(tmp_path):
@@ -575,9 +576,9 @@ def test_one_bad_message_costs_no_trial(tmp_path):
 
 @pytest.mark.parametrize('number', range(1, 6))
 def test_sample_sessions_are_usable(number):
-    found = read_session(SAMPLES / f'object{number}')
-    trials, refusals = session_trials(found, found.options)
-    assert (found.problems, refusals) == ((), ())
+    recorded = read_session(SAMPLES / f'object{number}')
+    trials, refusals = session_trials(recorded, recorded.options)
+    assert (recorded.warnings, refusals) == ((), ())
     assert [len(trial.hands) for trial in trials] == [1, 1, 1, 2]
     assert [goal.held_by for trial in trials for goal in trial.goals] == [
         (), (), ('left_hand',), ('left_hand', 'right_hand')]
@@ -585,12 +586,12 @@ def test_sample_sessions_are_usable(number):
 
 def shifted(messages, seconds, log_time):
     """Return messages of a clock that went back, recorded later."""
-    found = []
+    records = []
     for kind, message, _ in messages:
         message = STORE.deserialize_cdr(encode(message, INPUT_TYPES[kind]), INPUT_TYPES[kind])
         message.header.stamp.sec -= seconds
-        found.append((kind, message, log_time))
-    return found
+        records.append((kind, message, log_time))
+    return records
 
 
 def test_trials_before_and_after_the_clock_went_back_never_mix(tmp_path):
@@ -609,4 +610,4 @@ def test_a_recording_that_was_played_twice_gives_each_trial_once(tmp_path):
         write(writer, [*MESSAGES, *shifted(MESSAGES, 0, MESSAGES[-1][2] + SECOND)])
     trials, refusals = session_trials(read_session(writer.path), Options())
     assert len(trials) == 3
-    assert any('9 message(s) after the clock went back repeat earlier ones' in one for one in refusals)
+    assert any('9 message(s) after the clock went back repeat earlier ones' in text for text in refusals)

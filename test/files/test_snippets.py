@@ -43,15 +43,16 @@ def performed(snippet, names, written):
 def test_every_document_with_snippets_is_tried_here():
     documents = chain(ROOT.glob('*.md'), *(ROOT.glob(f'{folder}/**/*.md') for folder in (
         'benchmark', 'doc', 'examples', 'msg_samples')))
-    found = {str(file.relative_to(ROOT)) for file in documents if snippets(file)}
-    assert found == {'doc/export.md', 'doc/guide.md', 'doc/planning.md'}
+    documents = {str(file.relative_to(ROOT)) for file in documents if snippets(file)}
+    assert documents == {'doc/export.md', 'doc/guide.md', 'doc/planning.md'}
 
 
 def test_the_snippets_about_calibration_work(capsys):
     sample, few = str(ROOT / 'msg_samples/object1'), "evaluations=2, nodes=12, workers=1, engine='compiled'"
-    one, several = snippets('doc/guide.md')[1:3]
+    single, several = snippets('doc/guide.md')[1:3]
     names = {}
-    performed(one, names, written={'dlo_session_20260101_120000': sample, 'mass=0.03': f'mass=0.03, {few}'})
+    performed(single, names,
+              written={'dlo_session_20260101_120000': sample, 'mass=0.03': f'mass=0.03, {few}'})
     assert capsys.readouterr().out.count('flexibility') == 1
     read = names['session']
     names['session'] = SimpleNamespace(trials=read.trials, options=replace(

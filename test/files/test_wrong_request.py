@@ -125,7 +125,7 @@ def test_requests_at_the_wrong_time_are_refused_once(ros_environment, tmp_path):
         robot.until_result()
         refused('stop', 'no calibration under way', 'call ~/start first', again=' (2 times)')
         robot.until(lambda: [log.msg for log in robot.heard['log'] if log.level >= LOG_WARN
-                             and not log.msg.startswith('Do not use this result')] == expected)
+                             and not log.msg.startswith('Not usable')] == expected)
 
 
 def test_node_survives_mutated_bytes_and_calibrates_good_trials(ros_environment, tmp_path):
@@ -198,9 +198,9 @@ def test_a_full_disk_gives_one_warning_and_the_calibration_goes_on(ros_environme
         assert whole_result(robot)['trials'] == '4'
         robot.until(lambda: robot.status['last_refusal'])
         robot.until(lambda: any('cannot be written' in log.msg for log in robot.heard['log']))
-        # A search with so few evaluations has not reached a minimum, which is told, too.
+        # A search with so few evaluations reaches no minimum, and reports that, too.
         errors = [log.msg for log in robot.heard['log'] if log.level >= LOG_WARN
-                  and not log.msg.startswith('Do not use this result')]
+                  and not log.msg.startswith('Not usable')]
     text, = errors
     assert robot.status['last_refusal'] == text
     for word in ('session', str(tmp_path), 'cannot be written', os.strerror(errno.ENOSPC)):
@@ -307,8 +307,8 @@ def test_killed_at_any_moment_a_session_reads_up_to_its_last_complete_message(tm
             records = ()
         assert written <= len(records) <= written + 1
         for k, record in enumerate(records):
-            one = whole[k % len(whole)]
-            assert (record.topic, record.data, record.log_time) == (one.topic, one.data, k + 1)
+            original = whole[k % len(whole)]
+            assert (record.topic, record.data, record.log_time) == (original.topic, original.data, k + 1)
         counts.append(len(records))
     assert all(count >= 3 * turn for turn, count in enumerate(counts))  # the moments were different ones
 
@@ -329,13 +329,13 @@ def test_a_node_killed_while_it_records_loses_no_trial_of_its_status(ros_environ
         robot.until(lambda: robot.status['incomplete'] or robot.status['trials'] != '0')
         process.kill()
         process.wait()
-        told = [ros_robot.values(message.status[0]) for message in robot.heard['status']]
+        reported = [ros_robot.values(message.status[0]) for message in robot.heard['status']]
     folder, = (tmp_path / 'out').glob('dlo_session_*')
     session = read_session(folder)
     recorded = [ros_robot.values(message.status[0]) for message in session.outputs('status')]
-    assert told and all(one in recorded for one in told)
+    assert reported and all(status in recorded for status in reported)
     trials, _ = session_trials(session, Options())
-    assert len(trials) >= int(told[-1]['trials'])
+    assert len(trials) >= int(reported[-1]['trials'])
     assert command('fit', folder, '--json', '--evaluations', 4, '--workers', 1)[0] == (0 if trials else 2)
 
 

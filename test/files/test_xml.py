@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from random_examples import drawing
 
+from dlo_calibration.calibration.options import FileOptions
 from dlo_calibration.errors import InputError
 from dlo_calibration.files import xml
 from dlo_calibration.files.request import GoalRequest, Request, request_of, TrialRequest
@@ -24,7 +25,7 @@ from dlo_calibration.model.named_actions import LiftAndHold
 
 STRAIGHT = Chain(np.column_stack([np.linspace(0, 0.6, 4), np.zeros(4), np.zeros(4)]))
 REQUEST = Request((TrialRequest('one', STRAIGHT, (LiftAndHold(point=1),), (GoalRequest(STRAIGHT, 2.0),)),),
-                  {'mass': 0.03}, 'rope')
+                  FileOptions({'mass': 0.03}), 'rope')
 TEXT = REQUEST.document.decode()
 HEAD, BODY = TEXT.split('\n', 1)
 NAMED = 'calibration_request'
@@ -34,10 +35,10 @@ def refused(octets, match=None):
     """Return the refusal of a document, which takes one line and names the document."""
     with pytest.raises(InputError, match=match) as caught:
         parse(octets.encode() if isinstance(octets, str) else octets, 'file evil.xml', NAMED)
-    told = str(caught.value)
-    assert told.startswith('file evil.xml')
-    assert '\n' not in told and len(told) < 1000
-    return told
+    refusal = str(caught.value)
+    assert refusal.startswith('file evil.xml')
+    assert '\n' not in refusal and len(refusal) < 1000
+    return refusal
 
 
 def changed(old, new):
@@ -57,8 +58,8 @@ def test_external_entity_is_refused_and_not_read(tmp_path):
     secret = tmp_path / 'secret.txt'
     secret.write_text('the secret')
     evil = f'<!DOCTYPE {NAMED} [<!ENTITY s SYSTEM "{secret.as_uri()}">]>\n{BODY}'
-    told = refused(evil.replace('<settings/>', '<settings>&s;</settings>'), 'line 1: .*DOCTYPE')
-    assert 'the secret' not in told
+    refusal = refused(evil.replace('<settings/>', '<settings>&s;</settings>'), 'line 1: .*DOCTYPE')
+    assert 'the secret' not in refusal
 
 
 @pytest.mark.parametrize('doctype', [

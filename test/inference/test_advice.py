@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Which action is advised: where one alone would tell, where none would, and that it can be done."""
+"""The advised action: the only or most informative one, none if none helps, always one that can be done."""
 
 from concurrent.futures import CancelledError
 from dataclasses import replace
@@ -27,11 +27,11 @@ TRUTH = {'flexibility': 40.0, 'elasticity': 30.0, 'friction': 70.0, 'self_collis
 SPACE = ParameterSpace(('flexibility', 'friction'), {'elasticity': 30.0, 'self_collision': 20.0})
 
 
-class Telling(ToySimulator):
+class Informing(ToySimulator):
     """
-    It shows friction only in trials whose name has a given word.
+    It shows friction only in trials whose name contains a word.
 
-    :param worth: how much of it.
+    :param worth: share of its effect that shows.
     """
 
     def __init__(self, word, worth=1.0):
@@ -58,7 +58,7 @@ def observed(name, simulator=None, seed=0, trial=None):
         trial.goals, chains + noise, strict=True)))
 
 
-def found(simulator, *trials):
+def calibrated(simulator, *trials):
     return fitted(trials, SPACE, simulator, SEARCHES['least_squares'](2, 1), budget=80)
 
 
@@ -68,8 +68,8 @@ def advice_for(simulator, result, **rest):
 
 
 def test_the_only_action_that_informs_about_a_parameter_is_advised():
-    simulator = Telling('drag the middle')
-    result = found(simulator, observed('trial 1'), observed('trial 2', seed=1))
+    simulator = Informing('drag the middle')
+    result = calibrated(simulator, observed('trial 1'), observed('trial 2', seed=1))
     assert result.parameters['friction'].verdict == 'not identifiable'
     advice = advice_for(simulator, result)
     assert (advice.parameter, advice.action) == ('friction', 'drag')
@@ -80,46 +80,46 @@ def test_the_only_action_that_informs_about_a_parameter_is_advised():
 
 
 def test_the_expected_deviation_is_what_a_calibration_with_that_trial_gives():
-    simulator = Telling('drag the middle')
+    simulator = Informing('drag the middle')
     trials = [observed(f'trial {k}', seed=k) for k in (1, 2)]
-    result = found(simulator, *trials)
+    result = calibrated(simulator, *trials)
     advice = advice_for(simulator, result)
-    tried = next(one for one in candidates(trials) if one.words == advice.words).trial
-    again = found(simulator, *trials, observed(tried.name, simulator, 3, tried))
+    tried = next(candidate for candidate in candidates(trials) if candidate.words == advice.words).trial
+    again = calibrated(simulator, *trials, observed(tried.name, simulator, 3, tried))
     friction = again.parameters['friction']
     assert friction.verdict == 'identifiable'
     assert advice.expected_std == pytest.approx(friction.std / 100, rel=0.6)
 
 
 def test_nothing_is_advised_if_no_action_helps():
-    simulator = Telling('no such action')
-    result = found(simulator, observed('trial 1'), observed('trial 2', seed=1))
+    simulator = Informing('no such action')
+    result = calibrated(simulator, observed('trial 1'), observed('trial 2', seed=1))
     assert advice_for(simulator, result) is None
 
 
 def test_nothing_is_simulated_and_advised_if_all_parameters_are_identifiable():
-    simulator = Telling('')
-    result = found(simulator, observed('trial 1'), observed('trial 2', seed=1))
-    assert {one.verdict for one in result.parameters.values()} == {'identifiable'}
+    simulator = Informing('')
+    result = calibrated(simulator, observed('trial 1'), observed('trial 2', seed=1))
+    assert {estimate.verdict for estimate in result.parameters.values()} == {'identifiable'}
     simulator.names.clear()
     assert advice_for(simulator, result) is None
     assert simulator.names == []
 
 
 def test_the_most_informative_action_is_advised():
-    class Better(Telling):
+    class Better(Informing):
         def simulate(self, trial, physical):
             self.worth = 0.3 if 'middle' in trial.name else 1.0
             return super().simulate(trial, physical)
 
     simulator = Better('drag')
-    result = found(simulator, observed('trial 1'), observed('trial 2', seed=1))
+    result = calibrated(simulator, observed('trial 1'), observed('trial 2', seed=1))
     assert 'drag the first end' in advice_for(simulator, result).words
 
 
 def test_few_rollouts_are_spent():
-    simulator = Telling('drag')
-    result = found(simulator, observed('trial 1'), observed('trial 2', seed=1))
+    simulator = Informing('drag')
+    result = calibrated(simulator, observed('trial 1'), observed('trial 2', seed=1))
     simulator.names.clear()
     assert advice_for(simulator, result) is not None
     count = len(list(candidates(result.trials)))
@@ -131,14 +131,14 @@ def test_advice_is_sought_for_the_least_certain_of_many_parameters():
     """The toy shows four of thirty parameters, which are the most certain ones."""
     result = rest_shape_result()
     unsure = replace(result.examination.uncertainty, std=np.where(np.arange(30) < 4, 0.15, 0.2))
-    simulator = Telling('')
+    simulator = Informing('')
     assert advise(result.trials, result.space, Pool(simulator), result.best.point, unsure,
                   result.length) is None
     assert len(simulator.names) <= 2 * MOST_SOUGHT * len(list(candidates(result.trials)))
 
 
-class Failing(Telling):
-    """What would tell most diverges, or never comes to rest."""
+class Failing(Informing):
+    """The most informative action diverges, or never comes to rest."""
 
     def __init__(self, settles):
         super().__init__('drag')
@@ -155,22 +155,22 @@ class Failing(Telling):
 @pytest.mark.parametrize('settles', [False, True])
 def test_an_action_that_cannot_be_simulated_to_rest_is_not_advised(settles):
     simulator = Failing(settles)
-    result = found(simulator, observed('trial 1'), observed('trial 2', seed=1))
+    result = calibrated(simulator, observed('trial 1'), observed('trial 2', seed=1))
     advice = advice_for(simulator, result)
     assert 'drag' in advice.words
     assert 'the middle' not in advice.words
 
 
 def test_a_stop_gives_no_advice():
-    simulator = Telling('drag')
-    result = found(simulator, observed('trial 1'), observed('trial 2', seed=1))
+    simulator = Informing('drag')
+    result = calibrated(simulator, observed('trial 1'), observed('trial 2', seed=1))
     with pytest.raises(CancelledError):
         advice_for(simulator, result, should_stop=lambda: True)
 
 
 def test_a_result_that_is_no_minimum_gets_no_advice():
-    simulator = Telling('drag')
-    result = found(simulator, observed('trial 1'), observed('trial 2', seed=1))
+    simulator = Informing('drag')
+    result = calibrated(simulator, observed('trial 1'), observed('trial 2', seed=1))
     setting = Setting(result.trials, Options(), simulator)
     assert advised(setting, result).advice is not None
     for examination in (None, replace(result.examination, regular=False)):
@@ -193,23 +193,23 @@ def test_advised_actions_can_be_done_with_a_chain_of_any_shape(name):
     base = toy_trial(TRUTH, n=len(SHAPES[name]))
     chain = Chain(SHAPES[name])
     trial = Trial('trial 1', chain, base.actions, (Goal(chain, 2.0),))
-    some = list(candidates([trial]))
-    assert {one.action for one in some} >= {'lift_and_hold', 'drag', 'grasp_and_place'}
-    assert len({one.words for one in some}) == len(some)
-    for one in some:
-        assert one.action in NAMED_ACTIONS
-        assert one.trial.initial is chain
-        for hand in one.trial.hands:
+    actions = list(candidates([trial]))
+    assert {candidate.action for candidate in actions} >= {'lift_and_hold', 'drag', 'grasp_and_place'}
+    assert len({candidate.words for candidate in actions}) == len(actions)
+    for candidate in actions:
+        assert candidate.action in NAMED_ACTIONS
+        assert candidate.trial.initial is chain
+        for hand in candidate.trial.hands:
             assert np.isfinite(hand.positions).all()
             assert hand.positions[0] == pytest.approx(chain.gripped(hand.grips, hand.offset)[0])
-        for goal in one.trial.goals:
-            assert goal.stable is ('while it moves' not in one.words)
-            assert bool(one.trial.holding(goal)) is (one.action in ('lift_and_hold', 'two_hands') or
-                                                    not goal.stable)
+        for goal in candidate.trial.goals:
+            assert goal.stable is ('while it moves' not in candidate.words)
+            holds = candidate.action in ('lift_and_hold', 'two_hands')
+            assert bool(candidate.trial.holding(goal)) is (holds or not goal.stable)
 
 
 def test_actions_begin_where_a_trial_began_at_rest():
     moving = toy_trial(TRUTH)
     moving = Trial('moving', moving.initial, moving.actions, moving.goals, np.ones((11, 3)))
     resting = toy_trial(TRUTH, 'resting', turn=1.0)
-    assert all(one.trial.initial is resting.initial for one in candidates([moving, resting]))
+    assert all(candidate.trial.initial is resting.initial for candidate in candidates([moving, resting]))

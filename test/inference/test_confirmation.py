@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A second engine that confirms what a first one found."""
+"""A second engine confirms the result of the first."""
 
 from dataclasses import replace
 import json
@@ -51,19 +51,19 @@ class SecondToy(ToySimulator):
     def simulate(self, trial, physical):
         if self.failure is not None:
             raise self.failure
-        found = super().simulate(trial, physical)
+        rollout = super().simulate(trial, physical)
         if self.only is not None and trial.name not in self.only:
-            return found
-        return Rollout(found.chains + (0, self.shift, 0), found.settled, found.duration, found.steps)
+            return rollout
+        return Rollout(rollout.chains + (0, self.shift, 0), rollout.settled, rollout.duration, rollout.steps)
 
 
-def found(second):
+def calibrated(second):
     result = fitted(toy_trials(2), ParameterSpace(), ToySimulator(), RandomSearch(4, 1), budget=20)
     return result, confirmed(result, OPTIONS, engines(second))
 
 
 def test_the_result_stays_and_the_other_engines_figures_stand_beside_it():
-    before, after = found(SecondToy(0.004))
+    before, after = calibrated(SecondToy(0.004))
     assert after.values == before.values
     assert (after.best, after.engine, after.evaluations) == (before.best, 'toy', before.evaluations)
     other = after.confirmation
@@ -74,12 +74,12 @@ def test_the_result_stays_and_the_other_engines_figures_stand_beside_it():
     assert other.scores == pytest.approx(
         [TrialScore(trial)(chains) for trial, chains in zip(after.trials, moved, strict=True)])
     assert other.score == pytest.approx(np.mean(other.scores))
-    residual = np.concatenate([residuals(*one) for one in zip(after.trials, moved, strict=True)])
+    residual = np.concatenate([residuals(*pair) for pair in zip(after.trials, moved, strict=True)])
     assert other.errors.mean == pytest.approx(PointErrors.of(residual).mean)
 
 
 def test_a_confirmation_runs_beside_other_stages():
-    before, expected = found(SecondToy(0.004))
+    before, expected = calibrated(SecondToy(0.004))
     with confirming(before, SecondToy(0.004)) as confirm:
         after = confirm(replace(before, warnings=('of another stage',)))
     assert after.confirmation == expected.confirmation
@@ -87,25 +87,25 @@ def test_a_confirmation_runs_beside_other_stages():
 
 
 def test_nothing_is_simulated_where_there_is_nothing_to_confirm():
-    before, _ = found(SecondToy())
+    before, _ = calibrated(SecondToy())
     for options, second in ((Options(engine='compiled'), SecondToy()), (OPTIONS, ToySimulator())):
         assert confirmed(before, options, engines(second)) == before
 
 
 def test_a_confirmation_costs_no_evaluation():
-    before, after = found(SecondToy())
+    before, after = calibrated(SecondToy())
     assert after.simulations == before.simulations
 
 
 def test_engines_that_agree_cause_no_warning():
     for shift in (0.0, 1e-5):
-        before, after = found(SecondToy(shift))
+        before, after = calibrated(SecondToy(shift))
         assert after.confirmation is not None
         assert after.warnings == before.warnings == ()
 
 
 def test_a_disagreement_names_the_trial_and_how_much():
-    _, after = found(SecondToy(0.01, only=('trial 2',)))
+    _, after = calibrated(SecondToy(0.01, only=('trial 2',)))
     warning, = after.warnings
     assert warning.startswith('engine second toy disagrees with engine toy: trial 2: points 10.00 mm apart')
     assert 'trial 1' not in warning
@@ -114,17 +114,17 @@ def test_a_disagreement_names_the_trial_and_how_much():
     assert after.confirmation.mean_distance == pytest.approx(0.005)
 
 
-@pytest.mark.parametrize(('shift', 'score', 'other', 'tells'), [
+@pytest.mark.parametrize(('shift', 'score', 'other', 'reported'), [
     (0.0004, 1.0, 1.0, False), (0.0006, 1.0, 1.0, True),
     (0.0, 1.0, 1.09, False), (0.0, 1.0, 1.11, True), (0.0, 1.11, 1.0, True),
     (0.0, 10.0, 10.4, False), (0.0, 10.0, 10.6, True)])
-def test_only_differences_beyond_the_tolerances_are_reported(shift, score, other, tells):
+def test_only_differences_beyond_the_tolerances_are_reported(shift, score, other, reported):
     chain = np.zeros((1, 5, 3))
-    assert bool(disagreements(['a'], [chain], [chain + (shift, 0, 0)], [score], [other])) is tells
+    assert bool(disagreements(['a'], [chain], [chain + (shift, 0, 0)], [score], [other])) is reported
 
 
 def test_a_second_engine_that_fails_leaves_the_result_with_a_warning():
-    before, after = found(SecondToy(failure=SimulationError('the rollout diverged')))
+    before, after = calibrated(SecondToy(failure=SimulationError('the rollout diverged')))
     assert after.confirmation is None
     assert after.values == before.values
     assert after.warnings == ('not confirmed by engine bullet: the rollout diverged',)
@@ -224,7 +224,7 @@ def test_fit_and_validate_print_both_engines(command, tmp_path):
 
 
 def test_sentences_name_the_confirmation(tmp_path):
-    before, after = found(SecondToy(0.004))
+    before, after = calibrated(SecondToy(0.004))
     assert dict(fit_facts(plain(after)))['confirmed by second toy'].endswith(
         'points 4 mm from those of toy, 4 mm at most')
     assert 'confirmed by second toy' not in dict(fit_facts(plain(before)))
@@ -233,14 +233,14 @@ def test_sentences_name_the_confirmation(tmp_path):
 
 
 def test_result_files_hold_it_exactly(tmp_path):
-    before, after = found(SecondToy(1 / 300))
+    before, after = calibrated(SecondToy(1 / 300))
     for result in (before, after):
         write_result(tmp_path / 'result.xml', result)
         assert read_result(tmp_path / 'result.xml').confirmation == result.confirmation
 
 
 def test_the_message_holds_it():
-    before, after = found(SecondToy(0.004))
+    before, after = calibrated(SecondToy(0.004))
     whole = {pair.key: pair.value for pair in diagnostics.result(bag_types(), after, 0).status[-1].values}
     assert whole['confirmation_engine'] == 'second toy'
     assert float(whole['confirmation_score']) == after.confirmation.score

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""When the errors of trials that were left out of a fit count as smaller."""
+"""When the errors of left-out trials count as smaller."""
 
 import numpy as np
 import pytest

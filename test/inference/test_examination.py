@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What is found around a point, on models whose answer is known."""
+"""Examinations of models whose answer is known."""
 
 from functools import partial
 
@@ -10,7 +10,7 @@ import pytest
 
 from dlo_calibration.evaluation.linearisation import STEP, WIDEST
 from dlo_calibration.evaluation.residuals import ResidualLayout
-from dlo_calibration.inference.examination import examine
+from dlo_calibration.inference.examination import examine, SHORTEST
 from dlo_calibration.model.score import PointErrors
 
 LAYOUT = ResidualLayout(((1, 20), (2, 20), (1, 20)))
@@ -27,9 +27,9 @@ def linear(seed=0):
 
 class Model:
     """
-    It has residuals `errors + jacobian (x - truth)`, and remembers where it was asked.
+    A model with the residuals `errors + jacobian (x - truth)` that records the points it simulates.
 
-    :param fails: tells of a (d,) point whether it cannot be simulated.
+    :param fails: whether a (d,) point cannot be simulated.
     """
 
     def __init__(self, jacobian, errors, fails=lambda point: False):
@@ -54,40 +54,40 @@ def optimum(model, rows=slice(None)):
 
 def examined(model, point=None, finer=None, starts=(), **rest):
     point = optimum(model) if point is None else point
-    fine, *others = (None if one is None else partial(one, point[None, :]) for one in (finer, *starts))
+    fine, *others = (None if start is None else partial(start, point[None, :]) for start in (finer, *starts))
     return examine(point, model.at(point), LAYOUT, model, default=DEFAULT, noise=NOISE, finer=fine,
                    starts=others, **rest)
 
 
 def test_the_jacobian_of_a_linear_model_is_recovered():
     model = noisy_model()
-    found = examined(model)
-    assert found.jacobian == pytest.approx(model.jacobian, abs=1e-9)
-    assert found.regular
-    assert found.noise == NOISE
-    assert found.evaluations == len(model.asked)
-    assert found.uncertainty.verdicts == ('identifiable', 'identifiable')
+    examination = examined(model)
+    assert examination.jacobian == pytest.approx(model.jacobian, abs=1e-9)
+    assert examination.regular
+    assert examination.noise == NOISE
+    assert examination.evaluations == len(model.asked)
+    assert examination.uncertainty.verdicts == ('identifiable', 'identifiable')
 
 
-def test_steps_are_small_where_a_parameter_is_known_well_and_wide_where_it_is_not():
+def test_steps_are_small_for_certain_parameters_and_wide_for_uncertain_ones():
     model = noisy_model()
     model.jacobian[:, 1] *= 1e-3  # it moves the points by a tenth of the noise over its scale
     point = optimum(model)
     point[1] = 0.6
-    found = examined(model, point)
+    examination = examined(model, point)
     away = np.abs(np.array(model.asked) - point).round(9)
     beside = [away[away[:, 1 - k] == 0][:, k] for k in range(2)]
-    assert set(beside[0]) <= {0, STEP}
+    assert set(beside[0]) <= {0, SHORTEST, STEP}
     assert beside[1].max() == pytest.approx(WIDEST)
-    assert found.jacobian[:, 1] == pytest.approx(model.jacobian[:, 1], abs=1e-9)
-    assert found.uncertainty.verdicts[1] == 'not identifiable'
+    assert examination.jacobian[:, 1] == pytest.approx(model.jacobian[:, 1], abs=1e-9)
+    assert examination.uncertainty.verdicts[1] == 'not identifiable'
 
 
 def test_no_point_leaves_the_unit_cube():
     model = noisy_model()
     for point in ([0.0, 1.0], [0.01, 0.99]):
-        found = examined(model, np.array(point))
-        assert found.jacobian == pytest.approx(model.jacobian, abs=1e-9)
+        examination = examined(model, np.array(point))
+        assert examination.jacobian == pytest.approx(model.jacobian, abs=1e-9)
     assert np.min(model.asked) >= 0
     assert np.max(model.asked) <= 1
 
@@ -99,17 +99,17 @@ def test_cross_validation_is_the_error_of_refits_without_each_trial():
         others = np.delete(np.arange(ROWS), rows)
         left = model.at(optimum(model, others))[rows]
         distances.append(np.linalg.norm(left.reshape(-1, 3), axis=1))
-    found = examined(model)
-    assert found.cross_validated == pytest.approx(np.concatenate(distances).mean(), rel=0.01)
-    assert found.cross_validated > PointErrors.of(model.at(optimum(model))).mean
+    examination = examined(model)
+    assert examination.cross_validated == pytest.approx(np.concatenate(distances).mean(), rel=0.01)
+    assert examination.cross_validated > PointErrors.of(model.at(optimum(model))).mean
 
 
 def test_one_trial_cannot_be_cross_validated():
     model = noisy_model()
     point = optimum(model)
-    found = examine(point, model.at(point), ResidualLayout(((1, ROWS // 3),)), model,
+    examination = examine(point, model.at(point), ResidualLayout(((1, ROWS // 3),)), model,
                     default=DEFAULT, noise=NOISE)
-    assert np.isnan(found.cross_validated)
+    assert np.isnan(examination.cross_validated)
 
 
 def test_the_error_of_the_defaults_is_simulated():
@@ -120,41 +120,41 @@ def test_the_error_of_the_defaults_is_simulated():
 
 
 @pytest.mark.parametrize(('away', 'regular'), [(0.0, True), (0.3, False)])
-def test_a_point_from_which_it_goes_on_downhill_is_no_minimum(away, regular):
+def test_a_point_on_a_slope_is_no_minimum(away, regular):
     model = noisy_model()
     assert examined(model, optimum(model) + [away, 0.0]).regular is regular
 
 
-def test_where_one_side_fails_the_other_gives_the_derivative():
+def test_if_a_side_fails_the_other_gives_the_derivative():
     model = noisy_model(fails=lambda point: point[0] > 0.41)
-    found = examined(model)
-    assert found.jacobian == pytest.approx(model.jacobian, abs=1e-9)
+    examination = examined(model)
+    assert examination.jacobian == pytest.approx(model.jacobian, abs=1e-9)
 
 
-def test_where_both_sides_fail_the_parameter_counts_as_not_excited():
+def test_if_both_sides_fail_the_parameter_counts_as_not_excited():
     model = noisy_model()
     point = optimum(model)
     model.fails = lambda other: other[0] != point[0] and not np.array_equal(other, DEFAULT)
-    found = examined(model)
-    assert not found.jacobian[:, 0].any()
-    assert found.uncertainty.excited.tolist() == [False, True]
+    examination = examined(model)
+    assert not examination.jacobian[:, 0].any()
+    assert examination.uncertainty.excited.tolist() == [False, True]
 
 
 def test_a_finer_simulation_widens_what_it_moves():
     model = noisy_model()
     shift = np.array([0.1, 0.0])
     finer = Model(model.jacobian, model.errors - model.jacobian @ shift)
-    plain, found = examined(model), examined(model, finer=finer)
-    missing = 2 * shift[0]  # what halving the step moves is half of an error of first order
-    assert found.uncertainty.std[0] == pytest.approx(np.hypot(plain.uncertainty.std[0], missing), rel=0.02)
-    assert found.uncertainty.std[1] == pytest.approx(plain.uncertainty.std[1], rel=0.02)
-    assert found.evaluations == plain.evaluations + 1 + 2  # both ends of what became uncertain
+    plain, examination = examined(model), examined(model, finer=finer)
+    missing = 2 * shift[0]  # an error of first order: halving the step removes half of it
+    std, before = examination.uncertainty.std, plain.uncertainty.std
+    assert std == pytest.approx([np.hypot(before[0], missing), before[1]], rel=0.02)
+    assert examination.evaluations == plain.evaluations + 1 + 2  # both ends of what became uncertain
     assert len(finer.asked) == 1
 
 
 def test_if_the_finer_simulation_fails_nothing_is_identifiable():
-    found = examined(noisy_model(), finer=lambda points: [None])
-    assert found.uncertainty.verdicts == ('not identifiable', 'not identifiable')
+    examination = examined(noisy_model(), finer=lambda points: [None])
+    assert examination.uncertainty.verdicts == ('not identifiable', 'not identifiable')
 
 
 def test_other_noise_of_the_initial_chains_is_simulated_and_widens_what_it_moves():
@@ -162,11 +162,11 @@ def test_other_noise_of_the_initial_chains_is_simulated_and_widens_what_it_moves
     moved = model.jacobian @ np.array([0.003, 0.0])
     starts = [Model(model.jacobian, model.errors + sign * moved) for sign in (1, -1)]
     broken = Model(model.jacobian, model.errors, fails=lambda point: True)
-    plain, found = examined(model), examined(model, starts=[*starts, broken])
-    assert [len(one.asked) for one in (*starts, broken)] == [1, 1, 1]
-    assert found.evaluations == plain.evaluations + 3
-    assert found.uncertainty.std[0] > 2 * plain.uncertainty.std[0]
-    assert found.uncertainty.std[1] < 1.5 * plain.uncertainty.std[1]
+    plain, examination = examined(model), examined(model, starts=[*starts, broken])
+    assert [len(model.asked) for model in (*starts, broken)] == [1, 1, 1]
+    assert examination.evaluations == plain.evaluations + 3
+    assert examination.uncertainty.std[0] > 2 * plain.uncertainty.std[0]
+    assert examination.uncertainty.std[1] < 1.5 * plain.uncertainty.std[1]
 
 
 class Fading(Model):
@@ -189,34 +189,35 @@ def strain(value):
 
 
 def test_an_interval_reaches_to_where_the_effect_has_really_changed():
-    known, hardly = (examined(fading(1, size), TRUTH).uncertainty for size in (1.0, 0.007))
-    # Far better known than the effect fades: symmetric.
-    assert known.upper[0] - TRUTH[0] == pytest.approx(TRUTH[0] - known.lower[0], rel=0.1)
-    # About as large as the noise: it may be nothing as well.
-    assert TRUTH[0] - 1.645 * hardly.std[0] > 0.1
-    assert hardly.lower[0] == 0.0
-    # Where it grows there is an end.
-    assert hardly.upper[0] < TRUTH[0] + 1.7 * hardly.std[0]
-    assert hardly.upper[1] - hardly.lower[1] == pytest.approx(known.upper[1] - known.lower[1], rel=0.1)
+    certain, uncertain = (examined(fading(1, size), TRUTH).uncertainty for size in (1.0, 0.007))
+    # The interval is far narrower than the range over which the effect fades: symmetric.
+    assert certain.upper[0] - TRUTH[0] == pytest.approx(TRUTH[0] - certain.lower[0], rel=0.1)
+    # The effect is about as large as the noise, and may be nothing.
+    assert TRUTH[0] - 1.645 * uncertain.std[0] > 0.1
+    assert uncertain.lower[0] == 0.0
+    # The interval ends where the effect grows.
+    assert uncertain.upper[0] < TRUTH[0] + 1.7 * uncertain.std[0]
+    width, certain_width = (each.upper[1] - each.lower[1] for each in (uncertain, certain))
+    assert width == pytest.approx(certain_width, rel=0.1)
 
 
 def test_intervals_of_a_linear_model_stay_as_they_are():
     model = noisy_model()
     model.jacobian[:, 0] *= 0.01
     point = np.array([0.5, 0.6])
-    found = examined(model, point).uncertainty
-    half = 1.645 * found.std
+    examination = examined(model, point).uncertainty
+    half = 1.645 * examination.std
     assert 0.02 < half[0] < 0.4
-    assert found.lower == pytest.approx(point - half)
-    assert found.upper == pytest.approx(point + half)
+    assert examination.lower == pytest.approx(point - half)
+    assert examination.upper == pytest.approx(point + half)
 
 
 def test_an_end_that_cannot_be_simulated_stays_where_it_is():
     model = fading(1, 0.007)
     usual = examined(model, TRUTH).uncertainty
     model.fails = lambda point: point[0] < TRUTH[0] - usual.std[0]
-    found = examined(model, TRUTH).uncertainty
-    assert found.lower[0] > usual.lower[0]
+    examination = examined(model, TRUTH).uncertainty
+    assert examination.lower[0] > usual.lower[0]
 
 
 def test_a_stop_in_the_middle_is_passed_on():

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Missing parameters: what was held fixed, and would have explained the rest."""
+"""Missing parameters: fixed ones that would have explained the residuals."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ from dlo_calibration.search import LeastSquares
 from dlo_calibration.simulation.compiled import CompiledSimulator
 
 
-def found(trials, space=EVEN):
+def calibrated(trials, space=EVEN):
     simulator = CompiledSimulator(table=False, nodes=21)
     result = fitted(trials, space, simulator, LeastSquares(space.dimension, 1), budget=40)
     return with_missing_parameters(Setting(result.trials, Options(parts=1), simulator), result)
@@ -33,7 +33,7 @@ def candidates(space):
 @pytest.mark.parametrize('name, value', [
     ('natural_curvature', 15.0), pytest.param('bending_friction', 45.0, marks=pytest.mark.long)])
 def test_a_parameter_that_was_fixed_at_a_wrong_value_is_named(name, value):
-    result = found(observed(ParameterSpace((*EVEN.free, name)), {**TRUTH, name: value}))
+    result = calibrated(observed(ParameterSpace((*EVEN.free, name)), {**TRUTH, name: value}))
     assert result.missing_parameters[0].name == name
     assert result.missing_parameters[0].share > 0.15
     assert f'name {name}' in sentences(result)[-1]
@@ -43,14 +43,14 @@ def test_a_parameter_that_was_fixed_at_a_wrong_value_is_named(name, value):
 
 @pytest.mark.long
 def test_parts_of_different_stiffness_are_named():
-    result = found(observed(EVEN.divided(4), STIFF_MIDDLE))
+    result = calibrated(observed(EVEN.divided(4), STIFF_MIDDLE))
     assert result.missing_parameters[0].name == PARTS
     assert result.missing_parameters[0].share > 0.15
     assert 'set parts to 0' in sentences(result)[-1]
 
 
-def test_where_only_noise_is_left_there_is_nothing_to_explain():
-    result = found(observed(EVEN, TRUTH))
+def test_residuals_that_are_noise_need_no_explanation():
+    result = calibrated(observed(EVEN, TRUTH))
     assert result.missing_parameters == ()
     assert plain(result)['explanations'] == {}
 
@@ -60,7 +60,7 @@ def test_a_parameter_that_would_not_help_is_not_named():
     trials = [replace(trial, goals=tuple(
         replace(goal, chain=replace(goal.chain, points=goal.chain.points + 0.01 * (-1)**k))
         for k, goal in enumerate(trial.goals))) for trial in observed(EVEN, TRUTH)]
-    result = found(trials)
+    result = calibrated(trials)
     assert result.examination.uncertainty.residual > 5e-3
     assert result.missing_parameters == ()
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Slices go through what was found, show how the fit worsens, and end in time."""
+"""Slices contain the best values, show how the fit worsens, and end in time."""
 
 from dataclasses import replace
 import math
@@ -15,21 +15,21 @@ from dlo_calibration import calibrate
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.evaluation.evaluation import Evaluator
 from dlo_calibration.inference.slices import (
-    chosen,
     LEVELS,
     MOST_LINES,
     NARROWEST,
     pairs,
     simulate_slices,
+    varied_parameters,
 )
 
 
 @pytest.fixture(scope='module')
 def result():
     """Return what the toy finds; its optimum is the truth."""
-    found = calibrate(toy_trials(2), Options.of({'workers': 1}), make_simulator=new_toy)
-    assert found.values == pytest.approx(TRUTH, abs=1.0)
-    return found
+    result = calibrate(toy_trials(2), Options.of({'workers': 1}), make_simulator=new_toy)
+    assert result.values == pytest.approx(TRUTH, abs=1.0)
+    return result
 
 
 def around(result, simulator=None, seconds=60.0, **rest):
@@ -54,8 +54,8 @@ def test_of_many_parameters_the_papers_and_the_least_certain_have_lines():
     names = ['damping', 'friction', 'torsion', 'mass', 'marker_mass', 'flexibility', 'elasticity',
              'self_collision']
     std = np.array([0.2, 0.01, 0.1, 0.01, 0.15, 0.01, 0.01, 0.01])
-    assert chosen(names, std) == [0, 1, 4, 5, 6, 7]
-    assert chosen(names[:MOST_LINES], std[:MOST_LINES]) == list(range(MOST_LINES))
+    assert varied_parameters(names, std) == [0, 1, 4, 5, 6, 7]
+    assert varied_parameters(names[:MOST_LINES], std[:MOST_LINES]) == list(range(MOST_LINES))
 
 
 def test_errors_are_those_of_the_simulator(result):
@@ -87,7 +87,7 @@ def test_pair_that_depends_on_each_other_most_comes_first(result):
     assert pairs(4, examination) == expected
 
 
-def test_slices_that_take_too_long_are_left_out(result):
+def test_slices_that_would_take_too_long_are_omitted(result):
     now = iter(np.arange(10000.0))
     slices = around(result, seconds=40, clock=lambda: next(now))
     assert not slices.complete
@@ -105,6 +105,6 @@ def test_failed_points_of_a_slice_are_infinite(result):
 
 
 def test_slices_are_the_same_each_time(result):
-    one, two = (around(result) for _ in range(2))
-    assert all(np.array_equal(a.errors, b.errors) for a, b in zip(one.lines, two.lines, strict=True))
-    assert one.evaluations == two.evaluations
+    first, second = (around(result) for _ in range(2))
+    assert all(np.array_equal(a.errors, b.errors) for a, b in zip(first.lines, second.lines, strict=True))
+    assert first.evaluations == second.evaluations

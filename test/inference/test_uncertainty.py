@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a calibration says about what it does not know."""
+"""The uncertainty of calibrated parameters."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dlo_calibration.evaluation.linearisation import Linearisation
-from dlo_calibration.evaluation.residuals import ResidualLayout
+from dlo_calibration.evaluation.residuals import Huber, ResidualLayout
 from dlo_calibration.inference.uncertainty import (
     at_minimum,
     bootstrap,
@@ -17,6 +17,7 @@ from dlo_calibration.inference.uncertainty import (
     jackknife,
     optimum_shift,
     predictive_std,
+    prior_information,
     spread_of_best,
     verdict,
 )
@@ -31,7 +32,7 @@ class Tried:
 
 
 def tried(count, seed=0, weights=(1.0, 1.0, 0.0)):
-    """Return random evaluations whose score grows with the distance from the truth in the weighted ones."""
+    """Return random evaluations whose score is the weighted distance from the truth."""
     points = np.random.default_rng(seed).random((count, len(weights)))
     away = points - [*TRUTH, *[0.5] * (len(weights) - 2)]
     return [Tried(point, float(np.linalg.norm(np.multiply(weights, offset))))
@@ -39,17 +40,17 @@ def tried(count, seed=0, weights=(1.0, 1.0, 0.0)):
 
 
 def spread(evaluations):
-    best = min(evaluations, key=lambda one: one.score).point
+    best = min(evaluations, key=lambda evaluation: evaluation.score).point
     return best, spread_of_best(evaluations, best)
 
 
 @pytest.mark.parametrize('seed', range(10))
 def test_a_parameter_with_effect_is_identifiable_and_one_without_is_not(seed):
-    _, found = spread(tried(150, seed))
-    assert found.verdicts[2] == 'not identifiable'
-    assert 'not identifiable' not in found.verdicts[:2]
-    assert (found.std[:2] < 0.15).all()
-    assert found.std[2] > found.std[:2].max()
+    _, uncertainty = spread(tried(150, seed))
+    assert uncertainty.verdicts[2] == 'not identifiable'
+    assert 'not identifiable' not in uncertainty.verdicts[:2]
+    assert (uncertainty.std[:2] < 0.15).all()
+    assert uncertainty.std[2] > uncertainty.std[:2].max()
 
 
 @pytest.mark.parametrize(('lower', 'upper', 'expected'), [
@@ -61,22 +62,22 @@ def test_the_verdict_is_the_width_of_the_interval_and_a_bound_is_weak_at_best(lo
 
 @pytest.mark.parametrize('seed', range(10))
 def test_the_interval_contains_the_best_and_all_good_evaluations(seed):
-    best, found = spread(tried(150, seed))
-    assert (found.lower <= best).all()
-    assert (best <= found.upper).all()
-    assert (found.lower[:2] <= TRUTH + 0.05).all()
-    assert (found.upper[:2] >= TRUTH - 0.05).all()
-    assert (found.lower >= 0).all()
-    assert (found.upper <= 1).all()
+    best, uncertainty = spread(tried(150, seed))
+    assert (uncertainty.lower <= best).all()
+    assert (best <= uncertainty.upper).all()
+    assert (uncertainty.lower[:2] <= TRUTH + 0.05).all()
+    assert (uncertainty.upper[:2] >= TRUTH - 0.05).all()
+    assert (uncertainty.lower >= 0).all()
+    assert (uncertainty.upper <= 1).all()
 
 
 @pytest.mark.parametrize('count', [1, 3, 15])
 def test_from_few_evaluations_nothing_is_identifiable(count):
-    _, found = spread(tried(count))
-    assert found.verdicts == ('not identifiable',) * 3
-    assert found.lower.tolist() == [0, 0, 0]
-    assert found.upper.tolist() == [1, 1, 1]
-    assert found.std == pytest.approx(np.full(3, 12**-0.5))  # as of any value between 0 and 1
+    _, uncertainty = spread(tried(count))
+    assert uncertainty.verdicts == ('not identifiable',) * 3
+    assert uncertainty.lower.tolist() == [0, 0, 0]
+    assert uncertainty.upper.tolist() == [1, 1, 1]
+    assert uncertainty.std == pytest.approx(np.full(3, 12**-0.5))  # as of any value between 0 and 1
 
 
 def test_failed_evaluations_count_as_bad_ones():
@@ -112,14 +113,14 @@ def fitted(jacobian, errors):
     return moved, errors + jacobian @ moved
 
 
-def coverage(errors_of, draws=300, **known):
+def coverage(errors_of, draws=300, **options):
     """Return the share of draws of the errors whose intervals contain the truth, for each parameter."""
     jacobian = linear_model()
     inside = []
     for draw in range(draws):
         moved, residuals = fitted(jacobian, errors_of(np.random.default_rng(draw)))
-        found = at_minimum(Linearisation(POINT + moved, residuals, jacobian), LAYOUT, **known)
-        inside.append((found.lower <= POINT) & (POINT <= found.upper))
+        uncertainty = at_minimum(Linearisation(POINT + moved, residuals, jacobian), LAYOUT, **options)
+        inside.append((uncertainty.lower <= POINT) & (POINT <= uncertainty.upper))
     return np.mean(inside, axis=0)
 
 
@@ -151,9 +152,9 @@ def test_where_the_model_is_wrong_the_disagreement_of_the_trials_counts():
         errors[rows] -= jacobian[rows, 0] * away
     moved, residuals = fitted(jacobian, errors)
     noise_alone = at_minimum(Linearisation(POINT + moved, residuals, jacobian), LAYOUT, noise=1.0)
-    found = at_minimum(Linearisation(POINT + moved, residuals, jacobian), LAYOUT, noise=1e-3)
-    assert found.std[0] > 1.5 * noise_alone.std[0]
-    assert found.std[0] > 0.03
+    uncertainty = at_minimum(Linearisation(POINT + moved, residuals, jacobian), LAYOUT, noise=1e-3)
+    assert uncertainty.std[0] > 1.5 * noise_alone.std[0]
+    assert uncertainty.std[0] > 0.03
 
 
 REPEATS = ResidualLayout(((1, 40),) * 4)
@@ -170,7 +171,7 @@ def test_an_exact_repeat_of_a_trial_counts_once():
     moved = np.random.default_rng(12).normal(0, 1e-3, (3, 1, 120))
     single, fourfold = (
         at_minimum(repeated(np.tile(once, (count, 1)), count), ResidualLayout(((1, 40),) * count), noise=1e-3,
-                   starts=[np.tile(once + one, (count, 1)).ravel() for one in moved]) for count in (1, 4))
+                   starts=[np.tile(once + noise, (count, 1)).ravel() for noise in moved]) for count in (1, 4))
     # The residuals of one trial count as fewer by the three parameters.
     assert fourfold.std == pytest.approx(single.std, rel=0.03)
     assert fourfold.std[0] > 0.001
@@ -179,9 +180,9 @@ def test_an_exact_repeat_of_a_trial_counts_once():
 def test_a_repeat_averages_its_noise_and_not_the_error_of_the_model():
     generator = np.random.default_rng(13)
     noise, error = generator.normal(0, 1e-3, (4, 120)), generator.normal(0, 3e-3, (1, 120))
-    one, four = (at_minimum(repeated(noise[:count], count), ResidualLayout(((1, 40),) * count), noise=1e-3)
+    single, four = (at_minimum(repeated(noise[:count], count), ResidualLayout(((1, 40),) * count), noise=1e-3)
                  for count in (1, 4))
-    assert four.std / one.std == pytest.approx(np.full(3, 0.5), rel=0.15)
+    assert four.std / single.std == pytest.approx(np.full(3, 0.5), rel=0.15)
     wrong, again = (at_minimum(repeated(noise[:count] + error, count), ResidualLayout(((1, 40),) * count),
                                noise=1e-3) for count in (1, 4))
     assert (again.std / wrong.std > 0.85).all()
@@ -204,8 +205,8 @@ def test_nine_of_ten_intervals_contain_the_truth_where_repeats_share_the_error_o
         generator = np.random.default_rng(seed)
         errors = (generator.normal(0, 2e-3, 120) + generator.normal(0, 1e-3, (4, 120))).ravel()
         moved, residuals = fitted(jacobian, errors)
-        found = at_minimum(Linearisation(POINT + moved, residuals, jacobian), REPEATS, noise=1e-3)
-        inside.append((found.lower <= POINT) & (POINT <= found.upper))
+        uncertainty = at_minimum(Linearisation(POINT + moved, residuals, jacobian), REPEATS, noise=1e-3)
+        inside.append((uncertainty.lower <= POINT) & (POINT <= uncertainty.upper))
     assert (np.mean(inside, axis=0) > 0.85).all()
     assert (np.mean(inside, axis=0) < 0.96).all()
 
@@ -237,20 +238,20 @@ def test_a_parameter_without_effect_is_not_excited_and_can_be_anything():
     jacobian = linear_model()
     jacobian[:, 1] = 0.0
     residuals = np.random.default_rng(3).normal(0, 1e-3, ROWS)
-    found = at_minimum(Linearisation(POINT, residuals, jacobian), LAYOUT, noise=1e-3)
-    assert found.excited.tolist() == [True, False, True]
-    assert found.verdicts == ('identifiable', 'not identifiable', 'identifiable')
-    assert (found.lower[1], found.upper[1]) == (0, 1)
+    uncertainty = at_minimum(Linearisation(POINT, residuals, jacobian), LAYOUT, noise=1e-3)
+    assert uncertainty.excited.tolist() == [True, False, True]
+    assert uncertainty.verdicts == ('identifiable', 'not identifiable', 'identifiable')
+    assert (uncertainty.lower[1], uncertainty.upper[1]) == (0, 1)
 
 
 def test_two_parameters_that_only_show_together_are_named_as_a_combination():
     jacobian = linear_model()
     jacobian[:, 1] = jacobian[:, 0] * (1 + 1e-3 * np.linspace(-1, 1, ROWS))
     residuals = np.random.default_rng(4).normal(0, 1e-3, ROWS)
-    found = at_minimum(Linearisation(POINT, residuals, jacobian), LAYOUT, noise=1e-3)
-    assert found.verdicts == ('not identifiable', 'not identifiable', 'identifiable')
-    assert found.correlations[0, 1] < -0.95
-    combination, = found.undetermined
+    uncertainty = at_minimum(Linearisation(POINT, residuals, jacobian), LAYOUT, noise=1e-3)
+    assert uncertainty.verdicts == ('not identifiable', 'not identifiable', 'identifiable')
+    assert uncertainty.correlations[0, 1] < -0.95
+    combination, = uncertainty.undetermined
     assert np.abs(combination) == pytest.approx([2**-0.5, 2**-0.5, 0], abs=0.05)
     assert combination[0] * combination[1] < 0
 
@@ -258,10 +259,10 @@ def test_two_parameters_that_only_show_together_are_named_as_a_combination():
 def test_a_value_at_the_end_of_the_scale_is_flagged_and_its_interval_ends_there():
     residuals = np.random.default_rng(5).normal(0, 1e-3, ROWS)
     fit = Linearisation(np.array([0.0, 0.6, 1.0]), residuals, linear_model())
-    found = at_minimum(fit, LAYOUT, noise=1e-3)
-    assert found.at_bound.tolist() == [True, False, True]
-    assert found.lower[0] == 0
-    assert found.upper[2] == 1
+    uncertainty = at_minimum(fit, LAYOUT, noise=1e-3)
+    assert uncertainty.at_bound.tolist() == [True, False, True]
+    assert uncertainty.lower[0] == 0
+    assert uncertainty.upper[2] == 1
 
 
 def test_an_interval_contains_the_optimum_of_a_finer_simulation():
@@ -271,10 +272,10 @@ def test_an_interval_contains_the_optimum_of_a_finer_simulation():
     finer = residuals - jacobian @ finer_optimum
     shift = optimum_shift(Linearisation(POINT, residuals, jacobian), finer)
     assert shift == pytest.approx(finer_optimum, abs=1e-4)
-    found = at_minimum(Linearisation(POINT, residuals, jacobian), LAYOUT, noise=1e-3, shift=shift)
-    assert (found.lower <= POINT + finer_optimum).all()
-    assert (POINT + finer_optimum <= found.upper).all()
-    assert found.std[1] < 0.02
+    uncertainty = at_minimum(Linearisation(POINT, residuals, jacobian), LAYOUT, noise=1e-3, shift=shift)
+    assert (uncertainty.lower <= POINT + finer_optimum).all()
+    assert (POINT + finer_optimum <= uncertainty.upper).all()
+    assert uncertainty.std[1] < 0.02
 
 
 def test_other_noise_of_the_initial_chains_widens_an_interval_by_what_it_moves():
@@ -283,16 +284,16 @@ def test_other_noise_of_the_initial_chains_widens_an_interval_by_what_it_moves()
     rows = slice(3 * 40, 3 * 80)  # of the second trial
     moved = np.zeros(ROWS)
     moved[rows] = jacobian[rows, 0] * 0.01
-    share = np.sum(jacobian[rows]**2) / np.sum(jacobian**2)  # of what is known is from there
+    share = np.sum(jacobian[rows]**2) / np.sum(jacobian**2)  # of the information is from there
     fit = Linearisation(POINT[:1], residuals, jacobian)
     plain = at_minimum(fit, LAYOUT, noise=1e-3)
-    found = at_minimum(fit, LAYOUT, noise=1e-3, starts=[residuals + moved, residuals - moved])
-    assert found.std[0] == pytest.approx(np.hypot(plain.std[0], 0.01 * share), rel=0.2)
-    assert found.std[0] > 2 * plain.std[0]
+    uncertainty = at_minimum(fit, LAYOUT, noise=1e-3, starts=[residuals + moved, residuals - moved])
+    assert uncertainty.std[0] == pytest.approx(np.hypot(plain.std[0], 0.01 * share), rel=0.2)
+    assert uncertainty.std[0] > 2 * plain.std[0]
     unmoved = at_minimum(fit, LAYOUT, noise=1e-3, starts=[residuals])
     assert unmoved.std == pytest.approx(plain.std)
-    one_of_four = at_minimum(fit, LAYOUT, noise=1e-3, starts=[residuals + moved, *[residuals] * 3])
-    assert one_of_four.std[0] == pytest.approx(np.hypot(plain.std[0], 0.005 * share), rel=0.2)
+    single_start = at_minimum(fit, LAYOUT, noise=1e-3, starts=[residuals + moved, *[residuals] * 3])
+    assert single_start.std[0] == pytest.approx(np.hypot(plain.std[0], 0.005 * share), rel=0.2)
 
 
 def test_a_start_that_ends_elsewhere_altogether_is_an_outlier():
@@ -301,9 +302,9 @@ def test_a_start_that_ends_elsewhere_altogether_is_an_outlier():
     there, further = residuals.copy(), residuals.copy()
     there[:30] += 0.1
     further[:30] += 10.0
-    near, far = (at_minimum(Linearisation(POINT, residuals, jacobian), LAYOUT, noise=1e-3, starts=[one])
-                 for one in (there, further))
-    assert far.std == pytest.approx(near.std)
+    near, far = (at_minimum(Linearisation(POINT, residuals, jacobian), LAYOUT, noise=1e-3, starts=[start])
+                 for start in (there, further))
+    assert far.std == pytest.approx(near.std, rel=0.01)
 
 
 def test_outliers_hardly_widen_the_intervals():
@@ -311,8 +312,8 @@ def test_outliers_hardly_widen_the_intervals():
     spoilt = residuals.copy()
     spoilt[::60] += 0.1
     clean = at_minimum(Linearisation(POINT, residuals, linear_model()), LAYOUT, noise=1e-3)
-    found = at_minimum(Linearisation(POINT, spoilt, linear_model()), LAYOUT, noise=1e-3)
-    assert (found.std < 3 * clean.std).all()
+    uncertainty = at_minimum(Linearisation(POINT, spoilt, linear_model()), LAYOUT, noise=1e-3)
+    assert (uncertainty.std < 3 * clean.std).all()
 
 
 def test_white_residuals_count_each_and_smooth_ones_do_not():
@@ -328,3 +329,26 @@ def test_white_residuals_count_each_and_smooth_ones_do_not():
 def test_the_band_of_a_chain_follows_from_the_covariance():
     jacobian = np.array([[3.0], [0.0], [4.0], [0.0], [0.0], [0.0]])  # one point moves by 5 m per unit
     assert predictive_std(jacobian, np.array([[0.01]])) == pytest.approx([0.5, 0.0])
+
+
+def test_an_interval_contains_what_the_trials_say_without_any_one_of_them():
+    residuals = np.random.default_rng(11).normal(0, 1e-3, ROWS)
+    jacobian = linear_model()
+    first = LAYOUT.rows[0]
+    residuals[first] += 0.02 * jacobian[first, 0] / np.abs(jacobian[first, 0]).max()
+    fit = Linearisation(POINT, residuals, jacobian)
+    uncertainty = at_minimum(fit, LAYOUT, noise=1e-4)
+    loss = Huber.of(residuals)
+    weighted = fit.weighted(loss.roots(residuals) / uncertainty.scale)
+    without = POINT + jackknife(weighted, LAYOUT.rows, prior_information(len(POINT)))
+    assert (uncertainty.lower <= np.clip(without, 0, 1)).all()
+    assert (uncertainty.upper >= np.clip(without, 0, 1)).all()
+
+
+def test_an_error_of_the_hands_widens_the_intervals_as_far_as_it_moves_the_optimum():
+    residuals, jacobian = np.random.default_rng(12).normal(0, 1e-3, ROWS), linear_model()
+    fit = Linearisation(POINT, residuals, jacobian)
+    alone = at_minimum(fit, LAYOUT, noise=1e-3)
+    other = at_minimum(fit, LAYOUT, noise=1e-3, hands=[residuals + 0.05 * jacobian[:, 0]])
+    assert other.std[0] == pytest.approx(np.hypot(alone.std[0], 0.05), rel=0.05)
+    assert other.std[1] == pytest.approx(alone.std[1], rel=0.05)

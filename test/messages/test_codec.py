@@ -58,19 +58,19 @@ def refusal(kind, message):
 
 def test_written_chain_is_read_back(types):
     chain = Chain(curve(), np.arange(21) % 3, np.arange(21) == 4)
-    found = read(GOAL, codec.chain_cloud(types, chain, STAMP, 'world'))
-    assert (found.kind, found.stamp, found.frame_id) == (GOAL, STAMP, 'world')
-    np.testing.assert_array_equal(found.chain.points, chain.points)
-    np.testing.assert_array_equal(found.chain.hands, chain.hands)
-    np.testing.assert_array_equal(found.chain.features, chain.features)
+    message = read(GOAL, codec.chain_cloud(types, chain, STAMP, 'world'))
+    assert (message.kind, message.stamp, message.frame_id) == (GOAL, STAMP, 'world')
+    np.testing.assert_array_equal(message.chain.points, chain.points)
+    np.testing.assert_array_equal(message.chain.hands, chain.hands)
+    np.testing.assert_array_equal(message.chain.features, chain.features)
 
 
 def test_bare_cloud_has_no_annotation(types):
     message = cloud(types)
-    assert [one.name for one in message.fields] == ['x', 'y', 'z']
-    found = read(INITIAL, message)
-    assert found.chain.hands is None
-    assert not found.chain.features.any()
+    assert [field.name for field in message.fields] == ['x', 'y', 'z']
+    content = read(INITIAL, message)
+    assert content.chain.hands is None
+    assert not content.chain.features.any()
 
 
 def test_hand_field_of_zeros_means_that_no_hand_holds(types):
@@ -115,7 +115,7 @@ def test_any_layout_is_read(source, layout, seed, count):
                 at = k * (row_step if column else step) + offset
                 octets[at:at + dtype.itemsize] = values[k:k + 1].tobytes()
     message = cloud(
-        types, fields=[field(types, *one) for one in fields], is_bigendian=big, point_step=step,
+        types, fields=[field(types, *row) for row in fields], is_bigendian=big, point_step=step,
         row_step=row_step, data=types.octets(bytes(octets)), height=count if column else 1,
         width=1 if column else count)
     chain = read(INITIAL, message).chain
@@ -130,8 +130,8 @@ def test_any_layout_is_read(source, layout, seed, count):
 def test_last_row_needs_no_padding(types):
     full = cloud(types)
     padded = b''.join(bytes(full.data[k:k + 24]) + b'pad' for k in range(0, len(full.data), 24))[:-3]
-    found = read(INITIAL, cloud(types, height=21, width=1, row_step=27, data=types.octets(padded)))
-    np.testing.assert_array_equal(found.chain.points, curve())
+    message = read(INITIAL, cloud(types, height=21, width=1, row_step=27, data=types.octets(padded)))
+    np.testing.assert_array_equal(message.chain.points, curve())
 
 
 @pytest.mark.parametrize(('changes', 'words'), [
@@ -148,7 +148,7 @@ def test_impossible_shape_is_refused(types, changes, words):
     assert words in refusal(GOAL, cloud(types, **changes))
 
 
-def test_too_many_points_are_refused_before_their_bytes_are_looked_at(types):
+def test_too_many_points_are_refused_before_their_bytes_are_read(types):
     assert '4000000000 points; expected at most' in refusal(INITIAL, cloud(types, width=4_000_000_000))
 
 
@@ -164,7 +164,7 @@ def test_too_many_points_are_refused_before_their_bytes_are_looked_at(types):
     ([('x', 7, 0), ('y', 7, 4), ('z', 7, 8), ('x', 7, 12)], "two fields 'x'"),
 ])
 def test_unusable_field_is_refused(types, fields, words):
-    assert words in refusal(GOAL, cloud(types, fields=[field(types, *one) for one in fields]))
+    assert words in refusal(GOAL, cloud(types, fields=[field(types, *row) for row in fields]))
 
 
 def test_hand_beyond_eight_is_refused(types):
@@ -197,11 +197,11 @@ def test_stamp_must_be_a_time(types, kind, seconds, words):
 # ---- reading actions
 
 def test_written_action_is_read_back(types):
-    found = read(ACTION, codec.action_trajectory(types, action()))
-    assert (found.kind, found.stamp, found.frame_id) == (ACTION, STAMP, 'world')
-    assert found.names == ('left_hand', 'right_hand')
+    message = read(ACTION, codec.action_trajectory(types, action()))
+    assert (message.kind, message.stamp, message.frame_id) == (ACTION, STAMP, 'world')
+    assert message.names == ('left_hand', 'right_hand')
     for name in ('times', 'positions', 'orientations'):
-        np.testing.assert_array_equal(getattr(found, name), getattr(action(), name))
+        np.testing.assert_array_equal(getattr(message, name), getattr(action(), name))
 
 
 def test_velocities_of_an_action_are_ignored(types):
@@ -266,9 +266,9 @@ def test_written_messages_cross_the_wire(types):
     """All that is written can be serialised and comes back as it was."""
     travel = wire(types)
     chain = Chain(curve(), np.arange(21) % 2, np.arange(21) == 4)
-    found = read(INITIAL, travel(codec.chain_cloud(types, chain, STAMP, 'world')))
-    np.testing.assert_array_equal(found.chain.points, chain.points)
-    np.testing.assert_array_equal(found.chain.hands, chain.hands)
+    message = read(INITIAL, travel(codec.chain_cloud(types, chain, STAMP, 'world')))
+    np.testing.assert_array_equal(message.chain.points, chain.points)
+    np.testing.assert_array_equal(message.chain.hands, chain.hands)
     np.testing.assert_array_equal(
         read(ACTION, travel(codec.action_trajectory(types, action()))).positions, action().positions)
 

@@ -25,30 +25,30 @@ def collected(trials):
     collector = TrialCollector(Options())
     for message in trial_messages(trials, 'world'):
         collector.add(message)
-    assert not collector.problems
+    assert not collector.refusals
     return collector.trials
 
 
-def assert_same(found, trials):
-    assert len(found) == len(trials)
-    for one, other in zip(found, trials, strict=True):
-        np.testing.assert_array_equal(one.initial.points, other.initial.points)
-        assert (one.velocity is None) == (other.velocity is None)
-        if one.velocity is not None:
-            np.testing.assert_allclose(one.velocity, other.velocity, atol=1e-9)
-        begin = one.hands[0].start - other.hands[0].start  # time before the first closing is idle
-        assert len(one.hands) >= len(other.hands)  # a hand that goes on holding may come once more
-        for b in other.hands:
-            a, = (a for a in one.hands if a.name == b.name and abs(a.start - begin - b.start) < 3e-9)
+def assert_same(collected_trials, trials):
+    assert len(collected_trials) == len(trials)
+    for received, sent in zip(collected_trials, trials, strict=True):
+        np.testing.assert_array_equal(received.initial.points, sent.initial.points)
+        assert (received.velocity is None) == (sent.velocity is None)
+        if received.velocity is not None:
+            np.testing.assert_allclose(received.velocity, sent.velocity, atol=1e-9)
+        begin = received.hands[0].start - sent.hands[0].start  # time before the first closing is idle
+        assert len(received.hands) >= len(sent.hands)  # a hand that goes on holding may come once more
+        for b in sent.hands:
+            a, = (a for a in received.hands if a.name == b.name and abs(a.start - begin - b.start) < 3e-9)
             assert a.grips == b.grips
             assert a.offset == pytest.approx(b.offset, abs=1e-3)
             assert a.end - begin == pytest.approx(b.end, abs=3e-9)
             np.testing.assert_allclose(a.positions_at(b.times + begin), b.positions, atol=1e-7)
-        for a, b in zip(one.goals, other.goals, strict=True):
+        for a, b in zip(received.goals, sent.goals, strict=True):
             np.testing.assert_array_equal(a.chain.points, b.chain.points)
             assert a.time - begin == pytest.approx(b.time, abs=3e-9)
             assert a.stable == b.stable
-            assert {hand.name for hand in one.holding(a)} == {hand.name for hand in other.holding(b)}
+            assert {hand.name for hand in received.holding(a)} == {hand.name for hand in sent.holding(b)}
 
 
 @pytest.mark.parametrize('name', ['object1', 'object4', 'object5'])
@@ -61,7 +61,7 @@ def test_trials_of_a_session_are_the_same_again(name):
 @pytest.mark.parametrize('name', ['named_actions', 'hand_paths', 'push_and_release'])
 def test_trials_of_a_request_are_the_same_again(name):
     request = read_request(SAMPLES / 'xml' / f'{name}.xml')
-    trials, _ = request_trials(request, Options.of(request.options))
+    trials, _ = request_trials(request, request.file_options.options())
     assert_same(collected(trials), trials)
 
 
@@ -125,7 +125,7 @@ def test_points_that_were_not_seen_stay_unseen():
     velocity = np.tile([0.2, 0.0, 0.1], (6, 1))
     trial = Trial('trial 1', Chain(hidden[0]), (moved('left', 0, 0.0, ASIDE),),
                   (Goal(Chain(hidden[1]), 0.5, False), Goal(Chain(hidden[2]), 5.0)), velocity)
-    found, = collected([trial])
-    for one, other in zip([found.initial, *(goal.chain for goal in found.goals)], hidden, strict=True):
-        np.testing.assert_array_equal(one.observed, other)
-    np.testing.assert_allclose(found.velocity, velocity, atol=1e-9)
+    trials, = collected([trial])
+    for chain, seen in zip([trials.initial, *(goal.chain for goal in trials.goals)], hidden, strict=True):
+        np.testing.assert_array_equal(chain.observed, seen)
+    np.testing.assert_allclose(trials.velocity, velocity, atol=1e-9)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What is refused is told in a short, harmless line, and a reason that repeats is counted."""
+"""A refusal is reported in a harmless line that shortens only what came, and repeated reasons are counted."""
 
 import copy
 import pickle
@@ -9,13 +9,21 @@ import unicodedata
 
 from hypothesis import given
 from hypothesis import strategies as st
+import pytest
 from toy_messages import MINUTE, SECOND, session_messages, write_session
 from toy_simulator import new_toy
 from wrong_input import action, cloud, with_point
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.cli.main import main
-from dlo_calibration.errors import InputError, printable, SimulationError
+from dlo_calibration.errors import (
+    InputError,
+    LONGEST_TEXT,
+    LONGEST_WORD,
+    printable,
+    safe_line,
+    SimulationError,
+)
 from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.messages.codec import ACTION, bag_types, GOAL
 from dlo_calibration.messages.refusals import counted, MOST_REASONS, Refusals
@@ -26,8 +34,9 @@ HOSTILE = '\x1b]0;owned\x07\x1b[2J\x9b31m‮txt.exe\r\n$ fake\ud800'
 
 def harmless(text):
     """Tell whether a terminal only shows a text: no control, format or surrogate character, and one line."""
-    return not any(unicodedata.category(one) in ('Cc', 'Cs', 'Zl', 'Zp') or one in '\u202a\u202b\u202d\u202e'
-                   for one in text)
+    return not any(unicodedata.category(character) in ('Cc', 'Cs', 'Zl', 'Zp')
+                   or character in '\u202a\u202b\u202d\u202e'
+                   for character in text)
 
 
 def test_control_characters_are_escaped():
@@ -37,23 +46,32 @@ def test_control_characters_are_escaped():
 
 
 @given(st.lists(st.text(max_size=400), min_size=4, max_size=4))
-def test_an_error_is_one_short_line_whatever_came(parts):
+def test_an_error_is_one_line_of_limited_length_whatever_came(parts):
     error = InputError(*parts)
-    for one in (error, SimulationError(''.join(parts)), copy.copy(error)):
-        assert len(str(one)) <= 300
-        assert harmless(str(one))
+    for raised in (error, SimulationError(''.join(parts)), copy.copy(error)):
+        assert len(str(raised)) <= 4 * LONGEST_TEXT + 20
+        assert harmless(str(raised))
 
 
-def test_of_a_refusal_that_is_too_long_the_thing_and_the_remedy_survive():
-    text = str(InputError('goal_chain stamped 12.5 s', f"frame_id '{5_000_000 * 'x'}'", "'world'", 'reset'))
-    assert text.startswith("goal_chain stamped 12.5 s: frame_id 'xxx")
-    assert text.endswith("xxx'; expected 'world'; reset")
-    assert '…' in text and len(text) == 300
+@pytest.mark.parametrize('quote', ["'", '"'])
+def test_a_long_name_is_shortened_and_nothing_else(quote):
+    text = str(InputError('goal_chain stamped 12.5 s', f'frame_id {quote}{50_000 * "long name "}{quote}',
+                          "'world'", 'reset'))
+    assert text.startswith(f'goal_chain stamped 12.5 s: frame_id {quote}long name long')
+    assert text.endswith(f"name {quote}; expected 'world'; reset")
+    assert '…' in text and len(text) < 180
+
+
+def test_sentences_of_the_package_are_never_shortened():
+    words = ' '.join(f"the hands' word {k}" for k in range(40))
+    text = str(InputError(f'{words} (thing)', f"the trial's {words}", f'expected {words}', f'remedy {words}'))
+    assert len(text) > 2500 and '…' not in text
+    assert safe_line(f"the clamps' {words}, the trials' {words}").count(words) == 2
 
 
 def test_an_error_does_not_keep_the_megabytes_that_came():
     error = InputError('thing', 5_000_000 * 'x', 'less', 'shorten it')
-    assert len(error.came) <= 300 and len(pickle.dumps(error)) < 1000
+    assert len(error.came) <= LONGEST_WORD and len(pickle.dumps(error)) < 1000
 
 
 def test_refusals_for_one_reason_are_one_line_with_the_first_stamp():
@@ -74,13 +92,13 @@ def test_the_number_of_reported_reasons_is_limited():
 
 
 def test_a_repeated_refusal_is_reported_at_once_then_at_growing_intervals_and_never_lost():
-    refusals, told = Refusals(), []
+    refusals, reports = Refusals(), []
     for k in range(3000):  # at 10 Hz
         refusals.add(f'goal_chain stamped {k} s: bad')
-        told += [(k / 10, text) for text in refusals.due(k / 10)]
-    assert told[0] == (0.0, 'goal_chain stamped 0 s: bad')
-    assert told[1] == (1.0, 'goal_chain stamped 10 s: bad (11 times)')
-    assert [round(when) for when, _ in told] == [0, 1, 3, 7, 15, 31, 63, 123, 183, 243]
+        reports += [(k / 10, text) for text in refusals.due(k / 10)]
+    assert reports[0] == (0.0, 'goal_chain stamped 0 s: bad')
+    assert reports[1] == (1.0, 'goal_chain stamped 10 s: bad (11 times)')
+    assert [round(when) for when, _ in reports] == [0, 1, 3, 7, 15, 31, 63, 123, 183, 243]
     refusals.add('another reason')
     assert refusals.due(300.0) == ['another reason']
     assert refusals.rest() == ['goal_chain stamped 2999 s: bad (3000 times)']

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A clock that goes back is told from messages that come late."""
+"""A clock that goes back is distinguished from messages that come late."""
 
 import pytest
 from test_collector import action, goal, initial
@@ -21,7 +21,7 @@ def after(*messages):
 
 @pytest.mark.parametrize('message', [
     initial(30), initial(105), initial(140)], ids=['before all', 'within a trial', 'between trials'])
-def test_an_initial_chain_long_before_the_newest_one_is_of_a_clock_that_went_back(message):
+def test_an_initial_chain_long_before_the_newest_one_shows_that_the_clock_went_back(message):
     assert after(*TRIALS).clock_went_back(message)
 
 
@@ -29,7 +29,7 @@ def test_an_initial_chain_long_before_the_newest_one_is_of_a_clock_that_went_bac
     (TRIALS, initial(159.5)), (TRIALS, initial(200)),
     (TRIALS[:4], action(101)), ((initial(100), goal(110)), action(50)),
     ((initial(2000), initial(101), action(102)), initial(105)),
-], ids=['another tracker', 'the next trial', 'an action that is told when it is over', 'its topic is new',
+], ids=['another tracker', 'the next trial', 'an action that is sent when it is over', 'its topic is new',
         'one stamp was wrong'])
 def test_a_late_message_is_no_clock_that_went_back(earlier, message):
     order = after(*earlier)

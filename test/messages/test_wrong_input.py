@@ -73,7 +73,7 @@ class Topics:
 
         def warnings():
             return [log.msg for log in self.robot.heard['log'][mark[1]:]
-                    if log.level >= LOG_WARN and 'Do not use this result' not in log.msg]
+                    if log.level >= LOG_WARN and 'Not usable' not in log.msg]
 
         self.robot.until(warnings, 'no refusal')
         self.robot.until(lambda: texts() and texts()[-1] == warnings()[-1], 'no refusal in status')
@@ -120,12 +120,14 @@ def test_wrong_message_on_a_topic_is_refused_once_and_the_trials_stay(topics, ca
         assert word in refusal.text
 
 
-@pytest.mark.parametrize('case', WRONG, ids=lambda case: case.name)
+# In a file, in the order of stamps, that goal is one of a tracker that was on already.
+@pytest.mark.parametrize('case', [case for case in WRONG if case.name != 'backward stamp, goal'],
+                         ids=lambda case: case.name)
 def test_wrong_message_in_a_file_is_refused_once_and_the_trials_calibrate(tmp_path, command, case):
     path = write_session(tmp_path / 'session.mcap', [*GOOD, (case.kind, made(case, FILES))], QUICK)
     session = read_session(path)
     trials, (refusal,) = session_trials(session, Options())
-    assert (len(trials), session.problems) == (2, ())
+    assert (len(trials), session.warnings) == (2, ())
     for word in case.words():
         assert word in refusal
     assert score_of(trials) == good_score()
@@ -198,10 +200,10 @@ def test_wrong_parameter_is_refused_once_by_the_command_line(tmp_path, command, 
 @pytest.mark.parametrize(('name', 'value', 'text'), PARAMETERS)
 def test_wrong_parameter_in_a_recording_is_left_out_with_one_warning(tmp_path, command, name, value, text):
     path = write_session(tmp_path / 'session.mcap', GOOD, {**QUICK, name: value})
-    flags = (word for one in QUICK for word in (f'--{one}', *np.atleast_1d(QUICK[one])))
+    flags = (word for name in QUICK for word in (f'--{name}', *np.atleast_1d(QUICK[name])))
     code, result, errors = command('fit', path, '--json', *flags)
-    problem, = errors
-    assert f'left out: {text}' in problem
+    refusal, = errors
+    assert f'left out: {text}' in refusal
     assert (code, result['score']) == (0, good_score())
 
 
@@ -221,7 +223,7 @@ def collected(messages):
             assert all((error.thing, error.came, error.expected, error.remedy))
             assert contents(collector.trials) == before
         collector.take_refusals()
-        str(collector.problems), str(collector.loose_end), str(collector.incomplete)
+        str(collector.refusals), str(collector.loose_end), str(collector.incomplete)
     return collector
 
 

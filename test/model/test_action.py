@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The hands' paths: where a hand is at any time, and what is refused."""
+"""The paths of hands: poses at any time, and refusals."""
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -27,7 +27,7 @@ def test_positions_between_before_and_after_the_waypoints():
     assert turns == pytest.approx(np.tile(np.eye(3), (7, 1, 1)))
 
 
-def test_a_small_rotation_of_a_hand_is_kept():
+def test_a_small_rotation_of_a_hand_counts():
     hand = Hand('h', (0,), [0, 2], [[0, 0, 0], [1, 0, 0]], [[0, 0, 0, 1], about('z', 1e-6)])
     turn = Rotation.from_matrix(hand.poses(2.0)[1][0])
     assert turn.as_rotvec(degrees=True)[2] == pytest.approx(1e-6)
@@ -67,7 +67,7 @@ def test_a_single_waypoint_is_a_hand_that_rests():
     assert turns == pytest.approx(np.tile(np.eye(3), (3, 1, 1)))
 
 
-def test_a_point_that_is_named_twice_is_gripped_once():
+def test_a_repeated_point_is_gripped_once():
     assert Hand('h', (4, 2, 4), 0.0, [0, 0, 0]).grips == (4, 2)
 
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The rest shape is the curve with that curvature, and bending to and fro takes the energy of friction."""
+"""The rest shape has the given curvature, and a cycle of bending dissipates the energy of friction."""
 
 import numpy as np
 import pytest
@@ -39,15 +39,15 @@ def test_curvature_that_turns_evenly_is_a_helix():
 
 def test_many_shapes_at_once_are_those_of_each():
     curvatures = np.random.default_rng(0).normal(size=(4, 30, 2)) * 8
-    for one, points in zip(curvatures, rest_shape(curvatures, 0.7), strict=True):
-        np.testing.assert_allclose(points, rest_shape(one, 0.7))
+    for curvature, points in zip(curvatures, rest_shape(curvatures, 0.7), strict=True):
+        np.testing.assert_allclose(points, rest_shape(curvature, 0.7))
 
 
 def test_knots_are_joined_by_lines_and_added_to_the_constant_curvature():
     space = ParameterSpace(fixed={'natural_curvature': 20.0}).shaped(3)
     physical = space.physical({'rest_curvature_x2': 60.0, 'rest_curvature_y3': 30.0}, 1.0)
-    found = natural_curvature(physical, np.array([0.0, 0.25, 0.5, 1.0]))
-    np.testing.assert_allclose(found, [[2, 0], [4.5, 0], [7, 0], [2, -10]], atol=1e-9)
+    curvatures = natural_curvature(physical, np.array([0.0, 0.25, 0.5, 1.0]))
+    np.testing.assert_allclose(curvatures, [[2, 0], [4.5, 0], [7, 0], [2, -10]], atol=1e-9)
     straight = ParameterSpace().physical({}, 1.0)
     assert not natural_curvature(straight, np.linspace(0, 1, 5)).any()
 
@@ -64,8 +64,8 @@ def test_a_free_dlo_takes_this_rest_shape():
     rope.advance(np.zeros((3000, 0, 3)))
     expected = rest_shape(natural_curvature(physical, places[1:-1] / length), length)
     for far in (10, 20, 30):  # distances within the shape do not depend on where it lies
-        seen, drawn = (np.linalg.norm(one[far:] - one[:len(one) - far], axis=1)
-                       for one in (rope.points, expected))
+        seen, drawn = (np.linalg.norm(shape[far:] - shape[:len(shape) - far], axis=1)
+                       for shape in (rope.points, expected))
         np.testing.assert_allclose(seen, drawn, rtol=0.01)
 
 

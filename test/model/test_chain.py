@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The chain: a curve through all its points, lengths along it, and what is refused."""
+"""The chain: a curve through all its points, lengths along it, and refusals."""
 
 from dataclasses import FrozenInstanceError, replace
 
@@ -41,7 +41,7 @@ def test_the_curve_passes_through_every_point_at_its_own_place(chain):
 
 @drawing(30, derandomize=True)
 @given(chains(), st.floats(0, 1))
-def test_a_resampled_point_lies_as_far_along_as_was_asked(chain, share):
+def test_a_resampled_point_has_the_requested_arc_length(chain, share):
     at = share * chain.length
     fine = chain.resample(np.linspace(0, at, 2000))
     walked = np.linalg.norm(np.diff(fine, axis=0), axis=1).sum()
@@ -182,7 +182,7 @@ def test_times_that_no_clock_gives_are_refused(time):
         Hand('left', (0,), np.array([time]), np.zeros((1, 3)))
 
 
-def test_points_that_were_not_seen_lie_on_the_curve_through_the_others_and_are_known_as_such():
+def test_unseen_points_are_marked_and_lie_on_the_curve_through_the_others():
     turn = np.linspace(0, 1.5, 16)
     points = 0.3 * np.stack([np.sin(turn), 1 - np.cos(turn), np.zeros(16)], axis=1)
     hidden = points.copy()
@@ -198,7 +198,7 @@ def test_points_that_were_not_seen_lie_on_the_curve_through_the_others_and_are_k
     assert Chain(points).seen.all()
 
 
-def test_an_end_that_was_not_seen_goes_on_straight():
+def test_an_unseen_end_continues_straight():
     even = Chain(np.stack([np.linspace(0, 1, 7), np.zeros(7), np.zeros(7)], axis=1))
     points = even.points.copy()
     points[[0, -1]] = np.nan

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Named actions: the paths that hands take for them, and what cannot be done."""
+"""Named actions: the paths of their hands, and refusals."""
 
 import inspect
 

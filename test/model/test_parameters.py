@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The 0..100 scale: what each value means physically, and what stays where nothing is known."""
+"""The 0..100 scale: the physical value of each value, and defaults."""
 
 import math
 import subprocess
@@ -13,7 +13,14 @@ import pytest
 from random_examples import drawing
 
 from dlo_calibration import InputError
-from dlo_calibration.model.parameters import BY_NAME, PARAMETERS, ParameterSpace, PART_NAMES, REST_SHAPE
+from dlo_calibration.model.parameters import (
+    BY_NAME,
+    HANDS,
+    PARAMETERS,
+    ParameterSpace,
+    PART_NAMES,
+    REST_SHAPE,
+)
 
 PAPER = ('flexibility', 'elasticity', 'friction', 'self_collision')
 WEIGHT = 0.05 * 9.81  # N/m, of a DLO whose mass is not known
@@ -74,7 +81,7 @@ def test_a_point_of_the_cube_and_the_values_of_its_parameters():
 def test_physical_values_are_free_ones_then_fixed_ones_then_defaults():
     space = ParameterSpace(('flexibility',), {'friction': 10.0})
     physical = space.physical({'flexibility': 60.0}, length=1.0)
-    assert set(physical) == BY_NAME.keys() - {*PART_NAMES, *REST_SHAPE}
+    assert set(physical) == BY_NAME.keys() - {*PART_NAMES, *REST_SHAPE, *HANDS}
     assert physical['flexibility'] == pytest.approx(MAPPING['flexibility'](60), rel=1e-12)
     assert physical['friction'] == pytest.approx(MAPPING['friction'](10), rel=1e-12)
     assert physical['elasticity'] == pytest.approx(
@@ -141,7 +148,7 @@ def test_an_unknown_mass_is_that_of_the_assumed_density():
     assert ParameterSpace(mass=0.3).physical(dict.fromkeys(PAPER, 50), length=0.8)['mass'] == 0.3
 
 
-def test_stiffness_is_reported_per_weight_where_the_mass_is_not_known():
+def test_stiffness_is_reported_per_weight_if_the_mass_is_unknown():
     space = ParameterSpace()
     bending, unit = space.reported('flexibility', 40.0)
     assert bending == pytest.approx(MAPPING['flexibility'](40) / WEIGHT)
@@ -149,16 +156,16 @@ def test_stiffness_is_reported_per_weight_where_the_mass_is_not_known():
     stretching, unit = space.reported('elasticity', 40.0)
     assert stretching == pytest.approx(MAPPING['elasticity'](40) / WEIGHT)
     assert unit == 'N per N/m'
-    # What the weight has no part in stays what it is.
+    # Quantities that do not depend on the weight do not change.
     assert space.reported('friction', 40.0) == (pytest.approx(MAPPING['friction'](40)), '1')
     assert space.reported('self_collision', 40.0) == (pytest.approx(MAPPING['self_collision'](40)), 'm')
 
 
 @pytest.mark.parametrize(
-    'known', [{'mass': 0.03}, {'free': ('flexibility', 'mass')}, {'fixed': {'mass': 50.0}}],
+    'arguments', [{'mass': 0.03}, {'free': ('flexibility', 'mass')}, {'fixed': {'mass': 50.0}}],
     ids=['given', 'calibrated', 'fixed'])
-def test_stiffness_is_absolute_where_the_mass_is_given_calibrated_or_fixed(known):
-    space = ParameterSpace(**known)
+def test_stiffness_is_absolute_where_the_mass_is_given_calibrated_or_fixed(arguments):
+    space = ParameterSpace(**arguments)
     assert space.mass_known
     assert space.reported('flexibility', 40.0) == (pytest.approx(MAPPING['flexibility'](40)), 'N m^2')
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A pose does to points and quaternions what SciPy's rotations do, and its inverse undoes it."""
+"""A pose transforms points and quaternions as SciPy's rotations do, and its inverse reverts it."""
 
 import numpy as np
 import pytest

@@ -77,8 +77,8 @@ def test_the_focal_point_is_the_goals_point_nearest_to_a_hand_that_holds_it():
     hands = (hand('left', 0, 1, (2,), (0.52, 0, 0)), hand('right', 0, 1, (8,), (0.71, 0, 0)))
     held = trial(LINE, Goal(Chain(LINE), 2.0, held_by=('left', 'right')), hands=hands)
     assert focal_points(held).tolist() == [7]  # 1 cm away, the other's is 2 cm away
-    left = trial(LINE, Goal(Chain(LINE), 2.0, held_by=('left',)), hands=hands)
-    assert focal_points(left).tolist() == [5]
+    one_hand = trial(LINE, Goal(Chain(LINE), 2.0, held_by=('left',)), hands=hands)
+    assert focal_points(one_hand).tolist() == [5]
     free = trial(LINE, Goal(Chain(LINE), 2.0), hands=hands)
     assert focal_points(free).tolist() == [0]
 
@@ -105,8 +105,8 @@ def bumps():
     return points * 0.1
 
 
-def features_of(one):
-    return [np.flatnonzero(goal).tolist() for goal in feature_points(one)]
+def features_of(trial):
+    return [np.flatnonzero(goal).tolist() for goal in feature_points(trial)]
 
 
 def test_features_are_strict_extrema_of_the_goal_grips_and_annotations():
@@ -119,7 +119,7 @@ def test_features_are_strict_extrema_of_the_goal_grips_and_annotations():
     assert features_of(trial(bumps(), Goal(Chain(LINE), 2.0))) == [[0]]
 
 
-def test_a_grip_that_is_still_to_come_is_no_feature():
+def test_a_later_grip_is_no_feature():
     hands = (hand('left', 0, 1, (3,), (0, 0, 0)), hand('right', 5, 6, (7,), (0, 0, 0)))
     goals = (Goal(Chain(LINE), 2.0), Goal(Chain(LINE), 8.0))
     two = trial(LINE, *goals, hands=hands)
@@ -150,18 +150,19 @@ def test_point_errors_by_hand():
     assert errors.mean_abs == pytest.approx(0.028 / 9)
 
 
-def test_points_that_were_not_seen_count_nowhere():
+def test_unseen_points_do_not_count():
     random = np.random.default_rng(1)
     goal, current = random.random((9, 3)), random.random((9, 3))
     hidden = goal.copy()
     hidden[[0, 5]] = np.nan
-    kept = [1, 2, 3, 4, 6, 7, 8]
-    one = trial(random.random((9, 3)), Goal(Chain(hidden), 2.0))
-    whole = Trial('w', Chain(one.initial.points[kept]), (Action((hand('left', 0, 1, (0,), (9, 9, 9)),)),),
-                  (Goal(Chain(goal[kept], features=feature_points(one)[0][kept]), 2.0),))
-    assert focal_points(one).tolist() == [1]
-    assert not feature_points(one)[0][[0, 5]].any()
-    assert residuals(one, current[None]).tolist() == residuals(whole, current[None, kept]).tolist()
-    reference, features = 0, np.flatnonzero(feature_points(one)[0][kept])
-    assert TrialScore(one)(current[None]) == pytest.approx(
-        difference_score(goal[kept], current[kept], reference, features))
+    visible = [1, 2, 3, 4, 6, 7, 8]
+    partial = trial(random.random((9, 3)), Goal(Chain(hidden), 2.0))
+    action = Action((hand('left', 0, 1, (0,), (9, 9, 9)),))
+    whole = Trial('w', Chain(partial.initial.points[visible]), (action,),
+                  (Goal(Chain(goal[visible], features=feature_points(partial)[0][visible]), 2.0),))
+    assert focal_points(partial).tolist() == [1]
+    assert not feature_points(partial)[0][[0, 5]].any()
+    assert residuals(partial, current[None]).tolist() == residuals(whole, current[None, visible]).tolist()
+    reference, features = 0, np.flatnonzero(feature_points(partial)[0][visible])
+    assert TrialScore(partial)(current[None]) == pytest.approx(
+        difference_score(goal[visible], current[visible], reference, features))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The trial: order of actions and goals, which hands hold when, and what is refused."""
+"""The trial: the order of actions and goals, which hands hold when, and refusals."""
 
 from dataclasses import replace
 from itertools import permutations
@@ -93,7 +93,7 @@ def test_a_hand_holds_from_its_first_waypoint_to_its_last():
         assert names(waiting, Goal(CHAIN, time, stable=False)) == ['left']
 
 
-def test_after_its_last_waypoint_a_hand_holds_where_the_goal_shows_it():
+def test_after_its_last_waypoint_a_hand_holds_if_the_goal_says_so():
     done = trial([Action([hand('left', 0.0, 1.0), hand('right', 0.0, 1.0, (5,))])])
     assert names(done, Goal(CHAIN, 2.0)) == []
     assert names(done, Goal(CHAIN, 2.0, held_by=('right',))) == ['right']
@@ -138,16 +138,16 @@ def uneven(hidden):
     return Chain(points)
 
 
-def test_a_point_unseen_in_the_initial_chain_is_where_the_goals_show_it():
+def test_the_goals_place_a_point_unseen_in_the_initial_chain():
     goals = [Goal(uneven([6]), 2.0), Goal(uneven([1, 4]), 3.0)]
-    found = Trial('t', uneven([3, 7]), (Action((hand('left', 0.0, 1.0),)),), goals)
-    np.testing.assert_allclose(found.initial.points[:, 0], UNEVEN, atol=2e-3)
-    assert np.flatnonzero(~found.initial.seen).tolist() == [3, 7]
-    assert replace(found, name='u').initial is found.initial
+    observed = Trial('t', uneven([3, 7]), (Action((hand('left', 0.0, 1.0),)),), goals)
+    np.testing.assert_allclose(observed.initial.points[:, 0], UNEVEN, atol=2e-3)
+    assert np.flatnonzero(~observed.initial.seen).tolist() == [3, 7]
+    assert replace(observed, name='u').initial is observed.initial
 
 
 @pytest.mark.parametrize('turned', [False, True])
-def test_a_gripped_end_that_the_initial_chain_does_not_show_is_where_goals_show_it_held(turned):
+def test_the_goals_place_a_gripped_end_unseen_in_the_initial_chain(turned):
     angle = np.linspace(0, np.pi, 8)
     arc = 0.1 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
     hidden = np.where(np.arange(8)[:, None] > 0, arc, np.nan)
@@ -155,12 +155,75 @@ def test_a_gripped_end_that_the_initial_chain_does_not_show_is_where_goals_show_
     turns = [[0, 0, 0, 1], [0, 0, 1, 0] if turned else [0, 0, 0, 1]]
     grip = Hand('left', (0,), [0.0, 1.0], path, turns)
     goals = [Goal(Chain(arc + [0, 0, 0.1 * time]), time, stable=False) for time in (0.5, 1.0)]
-    found = Trial('t', Chain(hidden), (Action((grip,)),), goals)
-    apart = np.linalg.norm(found.initial.points[0] - arc[0])
-    assert apart > 0.005 if turned else apart < 1e-12
-    assert not found.initial.seen[0]
+    observed = Trial('t', Chain(hidden), (Action((grip,)),), goals)
+    distance = np.linalg.norm(observed.initial.points[0] - arc[0])
+    assert distance > 0.005 if turned else distance < 1e-12
+    assert not observed.initial.seen[0]
 
 
 def test_an_initial_chain_without_an_end_is_refused():
     with pytest.raises(InputError, match='whose last 2 points were not seen; expected at most one'):
         Trial('t', uneven([6, 7]), (Action((hand('left', 0.0, 1.0),)),), [Goal(uneven([0, 1]), 2.0)])
+
+
+# ---- errors of the hands
+
+def late_stream(velocity=None, start=0.5):
+    """Return a trial whose hand moves from 0.5 s to 1.5 s, with timed goals, and stable ones after it."""
+    points = np.stack([np.linspace(0, 0.5, 11), np.zeros(11), np.zeros(11)], axis=1)
+    hand = Hand('hand', (2,), np.array([start, 1.5]), points[2] + [[0, 0, 0], [0, 0.2, 0]], nearest=True)
+    goals = [Goal(Chain(points), time, stable=False) for time in (0.6, 0.9, 1.2)]
+    return Trial('t', Chain(points), (Action((hand,)),), (*goals, Goal(Chain(points), 1.6)), velocity)
+
+
+@pytest.mark.parametrize('velocity', [None, np.zeros((11, 3))], ids=['at rest', 'moving'])
+@pytest.mark.parametrize('late', [-0.2, -0.05, 0.05, 0.2])
+def test_late_hands_moved_earlier_against_the_timed_goals(late, velocity):
+    trial = late_stream(velocity)
+    moved = trial.with_late_hands(late)
+    before, after = ([goal.time - each.hands[0].times[-1] for goal in each.goals if not goal.stable]
+                     for each in (trial, moved))
+    assert after == pytest.approx(np.array(before) + late)
+    assert [goal.stable for goal in moved.goals] == [goal.stable for goal in trial.goals]
+    assert all(goal.time >= moved.hands[0].end for goal in moved.goals if goal.stable)
+    assert min(goal.time for goal in moved.goals) >= 0
+    np.testing.assert_array_equal(moved.hands[0].positions[-1], trial.hands[0].positions[-1])
+
+
+def test_a_hand_that_holds_from_the_start_still_does_where_its_stamps_are_early():
+    trial = late_stream(start=0.0)
+    early = trial.with_late_hands(-0.1)
+    assert early.hands[0].start == 0.0
+    assert early.clamped == trial.clamped
+    np.testing.assert_allclose(early.hands[0].positions_at(0.1), trial.hands[0].positions[:1])
+    np.testing.assert_allclose(early.hands[0].positions_at(1.6), trial.hands[0].positions[-1:])
+
+
+@pytest.mark.parametrize('shift', [(0.05, 0.01, 0.0), (-0.05, 0.0, 0.02)])
+def test_shifted_hands_grip_where_the_dlo_is_nearest(shift):
+    trial = late_stream()
+    moved = trial.with_shifted_hands(np.array(shift))
+    hand = moved.hands[0]
+    np.testing.assert_allclose(hand.positions, trial.hands[0].positions - shift)
+    assert hand.grips[0] + hand.offset == pytest.approx(2 - shift[0] / 0.05)
+    named = replace(trial, actions=(Action((replace(trial.hands[0], nearest=False),)),))
+    assert named.with_shifted_hands(np.array(shift)).hands[0].grips == (2,)
+
+
+def test_a_hand_that_goes_on_from_where_it_was_grips_the_same_after_a_shift():
+    trial = late_stream()
+    first = trial.hands[0]
+    again = replace(first, times=np.array([2.0, 3.0]), positions=first.positions[::-1], nearest=False)
+    both = replace(trial, actions=(Action((first,)), Action((again,))))
+    hands = both.with_shifted_hands(np.array([0.05, 0, 0])).hands
+    assert [hand.grips for hand in hands] == [(1,), (1,)]
+
+
+def test_hands_without_errors_stay_bit_for_bit():
+    trial = late_stream()
+    for same in (trial.with_late_hands(0.0), trial.with_shifted_hands(np.zeros(3))):
+        assert [goal.time for goal in same.goals] == [goal.time for goal in trial.goals]
+        for hand, other in zip(same.hands, trial.hands, strict=True):
+            assert (hand.grips, hand.offset) == (other.grips, other.offset)
+            assert hand.times.tobytes() == other.times.tobytes()
+            assert hand.positions.tobytes() == other.positions.tobytes()

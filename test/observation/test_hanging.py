@@ -21,47 +21,47 @@ def load_of(points, part, noise=MILLIMETRE):
 
 @pytest.mark.parametrize('bending', [1e-3, 1e-2, 1e-1])
 def test_stiffness_of_a_cantilever(bending):
-    found = load_of(observed(hung(bending, CLAMP), 31), Part(1, 30, ('unknown', 'free')))
-    assert WEIGHT / found.load == pytest.approx(bending, rel=0.05)
-    assert found.error < 0.3 * MILLIMETRE
+    load = load_of(observed(hung(bending, CLAMP), 31), Part(1, 30, ('unknown', 'free')))
+    assert WEIGHT / load.load == pytest.approx(bending, rel=0.05)
+    assert load.error < 0.3 * MILLIMETRE
 
 
 @pytest.mark.parametrize('bending', [1e-4, 1e-3])
 @pytest.mark.parametrize('ends', [('pin', 'pin'), ('unknown', 'unknown')])
 def test_stiffness_of_a_loop_between_two_pins(bending, ends):
     shape = hung(bending, {0: (0, 0, 1), 60: (0.3, 0.1, 1.05)})
-    found = load_of(observed(shape, 31), Part(0, 30, ends))
-    assert WEIGHT / found.load == pytest.approx(bending, rel=0.1)
+    load = load_of(observed(shape, 31), Part(0, 30, ends))
+    assert WEIGHT / load.load == pytest.approx(bending, rel=0.1)
 
 
 def test_a_hand_in_the_middle_is_a_force_of_its_own():
     shape = hung(1e-3, {0: (0.1, 0, 1), 30: (0.3, 0, 1.1), 60: (0.5, 0, 1)})
-    found = load_of(observed(shape, 31), Part(0, 30, ('pin', 'pin'), (15,)))
-    assert WEIGHT / found.load == pytest.approx(1e-3, rel=0.1)
+    load = load_of(observed(shape, 31), Part(0, 30, ('pin', 'pin'), (15,)))
+    assert WEIGHT / load.load == pytest.approx(1e-3, rel=0.1)
 
 
 def test_stretch_of_a_hanging_dlo():
     shape = hung(1e-4, {0: (0, 0, 1)}, stretching=5.0)
-    found = load_of(observed(shape, 31), Part(0, 30, ('pin', 'free')))
-    assert WEIGHT / found.stretch == pytest.approx(5.0, rel=0.1)
+    load = load_of(observed(shape, 31), Part(0, 30, ('pin', 'free')))
+    assert WEIGHT / load.stretch == pytest.approx(5.0, rel=0.1)
 
 
 def test_std_is_how_far_noise_moves_the_result():
     shape = hung(1e-3, {0: (0, 0, 1), 60: (0.4, 0, 1)})
     part = Part(0, 20, ('pin', 'pin'))
-    found = [load_of(observed(shape, 21, MILLIMETRE, seed), part) for seed in range(40)]
-    loads = np.array([one.load for one in found])
-    assert np.mean([one.std for one in found]) == pytest.approx(loads.std(), rel=0.4)
+    results = [load_of(observed(shape, 21, MILLIMETRE, seed), part) for seed in range(40)]
+    loads = np.array([result.load for result in results])
+    assert np.mean([result.std for result in results]) == pytest.approx(loads.std(), rel=0.4)
     assert np.abs(loads - WEIGHT / 1e-3).max() < 5 * loads.std()
 
 
 def test_order_and_frame_do_not_matter():
     points = observed(hung(1e-3, CLAMP), 31)
     part = Part(1, 30, ('unknown', 'free'))
-    found = load_of(points, part)
+    load = load_of(points, part)
     turn = np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]])
-    assert load_of(points @ turn + 7, part).load == pytest.approx(found.load, rel=1e-3)
-    assert load_of(points[::-1], Part(0, 29, ('free', 'unknown'))).load == pytest.approx(found.load, rel=1e-3)
+    assert load_of(points @ turn + 7, part).load == pytest.approx(load.load, rel=1e-3)
+    assert load_of(points[::-1], Part(0, 29, ('free', 'unknown'))).load == pytest.approx(load.load, rel=1e-3)
 
 
 def test_too_few_points_give_no_estimate():

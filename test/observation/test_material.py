@@ -35,8 +35,8 @@ def waving(seed, places=PLACES, noise=1e-4, stable=False, strength=1.5):
     last = len(places) - 1
     hands = [Hand(name, grips, [0.0, end], np.zeros((2, 3)))
              for name, grips in (('left', (0, 1)), ('right', (last - 1, last)))]
-    goals = [Goal(Chain(one), time, stable, ('left', 'right'))
-             for one, time in zip(points[1:], TIMES[1:], strict=True)]
+    goals = [Goal(Chain(chain), time, stable, ('left', 'right'))
+             for chain, time in zip(points[1:], TIMES[1:], strict=True)]
     return Trial(f'trial {seed}', Chain(points[0]), (Action(hands),), goals)
 
 
@@ -53,9 +53,9 @@ def test_trials_with_the_same_markers_share_more_accurate_arc_lengths():
     shared = with_shared_places(trials)
     for trial in shared[1:]:
         assert segments(trial)[1:-1] == pytest.approx(segments(shared[0])[1:-1], abs=1e-12)
-    one_chain, one_stream = (np.sqrt(np.mean([error(one)**2 for one in some]))
-                             for some in (trials, [with_shared_places([one])[0] for one in trials]))
-    assert error(shared[0]) < 0.8 * one_stream < 0.6 * one_chain
+    chain_error, stream_error = (np.sqrt(np.mean([error(trial)**2 for trial in some]))
+                                 for some in (trials, [with_shared_places([trial])[0] for trial in trials]))
+    assert error(shared[0]) < 0.8 * stream_error < 0.6 * chain_error
 
 
 def test_a_segment_in_a_clamp_keeps_the_distance_that_was_measured():

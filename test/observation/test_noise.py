@@ -53,10 +53,10 @@ def test_noise_does_not_depend_on_the_frame_and_follows_the_scale():
     places = np.linspace(0, 1, 21)
     first, second = (arc(places, radius) + random.normal(0, MILLIMETRE, (21, 3)) for radius in (0.3, 0.4))
     turn = np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]])
-    found = noise([trial_of(second, [(0,)], first)])
-    assert noise([trial_of(second @ turn + 5, [(0,)], first @ turn + 5)]) == pytest.approx(found)
-    assert noise([trial_of(second[::-1], [(0,)], first[::-1])]) == pytest.approx(found)
-    assert noise([trial_of(3 * second, [(0,)], 3 * first)]) == pytest.approx(3 * found)
+    level = noise([trial_of(second, [(0,)], first)])
+    assert noise([trial_of(second @ turn + 5, [(0,)], first @ turn + 5)]) == pytest.approx(level)
+    assert noise([trial_of(second[::-1], [(0,)], first[::-1])]) == pytest.approx(level)
+    assert noise([trial_of(3 * second, [(0,)], 3 * first)]) == pytest.approx(3 * level)
 
 
 def test_one_kink_is_no_noise():
@@ -88,15 +88,15 @@ def swinging(rate, sigma, *, frequency=0.5, seconds=4.0, rest=0.0, stable=False,
                        0.3 * along**2 + 0.1 * along * np.sin(1.7 * turn)], axis=2)
     points += random.normal(0, sigma, points.shape)
     hand = Hand('hand', (0,), [0.0, 1e-3 if stable else seconds], np.zeros((2, 3)))
-    goals = [Goal(Chain(one), time, stable) for one, time in zip(points[1:], times[1:], strict=True)]
+    goals = [Goal(Chain(chain), time, stable) for chain, time in zip(points[1:], times[1:], strict=True)]
     return Trial('stream', Chain(points[0]), (Action((hand,)),), goals)
 
 
 @pytest.mark.parametrize(('rate', 'frequency'), [(100, 0.3), (100, 3), (30, 0.3), (30, 1)])
 @pytest.mark.parametrize('size', [0.05, 1.0])
 def test_a_stream_shows_the_noise_of_points_with_bends_between_them(rate, frequency, size):
-    found = noise([swinging(rate, size * MILLIMETRE, frequency=frequency)])
-    assert found == pytest.approx(size * MILLIMETRE, rel=0.1)
+    level = noise([swinging(rate, size * MILLIMETRE, frequency=frequency)])
+    assert level == pytest.approx(size * MILLIMETRE, rel=0.1)
 
 
 def test_a_stream_of_a_dlo_at_rest_shows_the_noise_too():
@@ -114,10 +114,10 @@ def test_motion_that_is_too_fast_for_the_stream_is_no_noise():
 
 def test_a_tracker_that_misses_frames_sends_some_twice_or_stamps_them_unevenly_shows_the_same_noise():
     random = np.random.default_rng(4)
-    one = swinging(60, 0.1 * MILLIMETRE)
-    missed = Trial('m', one.initial, one.actions, [goal for goal in one.goals if random.random() < 0.7])
-    twice = Trial('t', one.initial, one.actions, [Goal(one.goals[k - k % 3].chain, goal.time, False)
-                                                  for k, goal in enumerate(one.goals)])
+    swing = swinging(60, 0.1 * MILLIMETRE)
+    missed = Trial('m', swing.initial, swing.actions, [goal for goal in swing.goals if random.random() < 0.7])
+    twice = Trial('t', swing.initial, swing.actions, [Goal(swing.goals[k - k % 3].chain, goal.time, False)
+                                                      for k, goal in enumerate(swing.goals)])
     for seen in (missed, twice):
         assert noise([seen]) == pytest.approx(0.1 * MILLIMETRE, rel=0.1)
 
@@ -201,25 +201,25 @@ def test_smoothing_does_not_depend_on_the_frame_or_the_direction():
     random = np.random.default_rng(10)
     rough = wave(np.linspace(0, 0.6, 21)) + random.normal(0, MILLIMETRE, (21, 3))
     turn = np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]])
-    found = smooth(rough, MILLIMETRE)
-    assert smooth(rough @ turn + 1, MILLIMETRE) == pytest.approx(found @ turn + 1)
-    assert smooth(rough[::-1], MILLIMETRE) == pytest.approx(found[::-1])
-    assert smooth(3 * rough, 3 * MILLIMETRE) == pytest.approx(3 * found)
+    smoothed = smooth(rough, MILLIMETRE)
+    assert smooth(rough @ turn + 1, MILLIMETRE) == pytest.approx(smoothed @ turn + 1)
+    assert smooth(rough[::-1], MILLIMETRE) == pytest.approx(smoothed[::-1])
+    assert smooth(3 * rough, 3 * MILLIMETRE) == pytest.approx(3 * smoothed)
 
 
 def test_places_are_even_where_noise_explains_that_they_are_not():
     even = np.linspace(0, 0.6, 21)
     truth = np.stack([even, 0 * even, 0 * even], axis=1)
     random = np.random.default_rng(11)
-    raw, found = [], []
+    raw, places = [], []
     for _ in range(50):
         rough = truth + random.normal(0, MILLIMETRE, truth.shape)
         steps = np.linalg.norm(np.diff(rough, axis=0), axis=1)
         raw.append(np.std(steps))
-        found.append(np.std(np.diff(places_along(rough, MILLIMETRE))))
+        places.append(np.std(np.diff(places_along(rough, MILLIMETRE))))
         assert places_along(rough, MILLIMETRE)[-1] == pytest.approx(steps.sum())
     assert np.mean(raw) == pytest.approx(np.sqrt(2) * MILLIMETRE, rel=0.1)
-    assert np.mean(found) < 0.3 * np.mean(raw)
+    assert np.mean(places) < 0.3 * np.mean(raw)
     uneven = np.stack([even**2, 0 * even, 0 * even], axis=1)
     assert places_along(uneven, 1e-6) == pytest.approx(even**2, rel=1e-4)
     assert places_along(uneven, 0.0).tolist() == pytest.approx((even**2).tolist(), abs=1e-15)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A trial in a wrong frame, unit or order of points is told, with the remedy; a good one never is."""
+"""A trial in a wrong frame, unit or order of points gives a warning with a remedy; a good one gives none."""
 
 from dataclasses import replace
 from importlib.util import module_from_spec, spec_from_file_location
@@ -21,7 +21,9 @@ from dlo_calibration.messages.collector import TrialCollector
 from dlo_calibration.messages.encoder import trial_messages
 from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.pose import Pose
+from dlo_calibration.model.trial import Goal
 from dlo_calibration.observation import implausible, implausible_trials
+from dlo_calibration.observation.plausibility import observation_warnings, repeated_trials, reversed_trials
 
 ROOT = Path(__file__).resolve().parents[2]
 SAMPLES = ROOT / 'msg_samples'
@@ -40,8 +42,8 @@ def moved(trial, position=(0.0, 0.0, 0.0), orientation=LEVEL, scale=1.0):
     """Return a trial as seen from a frame with another pose or unit."""
     trial = Pose(position, orientation).trial(trial)
 
-    def chain(one):
-        return replace(one, points=scale * one.points)
+    def chain(original):
+        return replace(original, points=scale * original.points)
 
     hands = [tuple(Hand(hand.name, hand.grips, hand.times, scale * hand.positions, hand.orientations)
                    for hand in action.hands) for action in trial.actions]
@@ -63,7 +65,7 @@ def test_nothing_is_wrong_with_a_sample_session(name):
 @pytest.mark.parametrize('name', ['push_and_release', 'hand_paths', 'named_actions'])
 def test_nothing_is_wrong_with_a_sample_request(name):
     request = read_request(SAMPLES / 'xml' / f'{name}.xml')
-    trials, _ = request_trials(request, Options.of(request.options))
+    trials, _ = request_trials(request, request.file_options.options())
     assert trials
     assert implausible_trials(trials, 0.0) == ()
 
@@ -114,6 +116,43 @@ def test_there_is_a_warning_about_points_that_run_from_the_other_end(lying):
     assert 'the last one of trial 1 from the other end' in text
 
 
+def whole(trial):
+    """Return a trial whose chains all run from the other end."""
+    return replace(trial, initial=turned(trial.initial),
+                   goals=tuple(replace(goal, chain=turned(goal.chain)) for goal in trial.goals))
+
+
+@pytest.mark.parametrize('which', ['initial', 'trial'])
+def test_a_reversed_trial_does_not_make_the_next_ones_reversed(lying, which):
+    session = [replace(trial, initial=before.goals[-1].chain)
+               for before, trial in zip(lying, lying[1:], strict=False)]
+    right = session[1]
+    session[1] = {'initial': replace(right, initial=turned(right.initial)), 'trial': whole(right)}[which]
+    texts = implausible_trials([lying[0], *session], 0.0)
+    assert {text.partition(':')[0] for text in texts} == {right.name}
+    assert len(texts) == 1 and 'from the other end' in texts[0] or 'the other end of the DLO' in texts[0]
+    assert reversed_trials([lying[0], *session]) == (False, False, True, False)
+
+
+def test_the_first_goal_of_a_stream_is_compared_with_the_initial_chain(lying):
+    first = lying[0]
+    soon = Goal(turned(first.initial), 0.1, stable=False)
+    text, = implausible(replace(first, goals=(soon, replace(first.goals[0], chain=turned(
+        first.goals[0].chain)))), 0.0)
+    assert 'a goal chain at 0.1 s whose points run from the other end' in text
+    assert implausible(replace(first, goals=(replace(soon, chain=first.initial), *first.goals)), 0.0) == ()
+
+
+def test_a_trial_that_repeats_another_bit_for_bit_is_named(lying):
+    again = replace(lying[0], name='trial 5')
+    assert repeated_trials(lying) == ()
+    text, = repeated_trials([*lying, again])
+    assert text.startswith('trial 5: the initial chain, hands and goal chains of trial 1, bit for bit')
+    goal = lying[0].goals[0]
+    other = replace(again, goals=(replace(goal, chain=replace(goal.chain, points=goal.chain.points + 1e-9)),))
+    assert repeated_trials([*lying, other]) == ()
+
+
 def hanging(away):
     """Return a trial whose DLO hangs on one pin, away from the vertical by an angle [rad]."""
     along = np.linspace(0.0, 0.5, 11)[:, None]
@@ -132,11 +171,11 @@ def test_a_dlo_on_a_pin_hangs_straight_below_it():
 
 def test_the_collector_warns_once_when_a_trial_is_complete(lying):
     collector = TrialCollector(Options())
-    told = []
+    warnings = []
     for message in trial_messages(tuple(moved(trial, (0, 0, 0.75)) for trial in lying[:2]), 'camera'):
         collector.add(message)
-        told += [(type(message) is ActionMessage, text) for text in collector.take_warnings()]
-    assert [text.split(':')[0] for _, text in told] == ['trial 1', 'trial 2']
+        warnings += [(type(message) is ActionMessage, text) for text in collector.take_warnings()]
+    assert [text.split(':')[0] for _, text in warnings] == ['trial 1', 'trial 2']
     assert collector.take_warnings() == ()
     assert collector.count == 2
     right = anew(collector, Options(table_height=0.75))
@@ -156,3 +195,34 @@ def test_nothing_is_wrong_with_measured_sessions(tmp_path, source):
     session = read_session(tmp_path / 'out')
     assert session.trials
     assert implausible_trials(session.trials, 0.0 if session.options.table else None) == ()
+
+
+def noisy(trials, sigma):
+    generator = np.random.default_rng(0)
+
+    def chain(exact):
+        return replace(exact, points=exact.points + generator.normal(0, sigma, exact.points.shape))
+
+    return [replace(trial, initial=chain(trial.initial),
+                    goals=tuple(replace(goal, chain=chain(goal.chain)) for goal in trial.goals))
+            for trial in trials]
+
+
+def test_nothing_is_wrong_with_the_observation_of_a_sample(lying):
+    assert observation_warnings(lying, 0.0, 0.03) == ()
+
+
+def test_the_noise_of_chains_is_named(lying):
+    words, = observation_warnings(noisy(lying, 0.007), 0.0, 0.03)
+    assert words.startswith('the chains: a noise of 7')
+
+
+@pytest.mark.parametrize(('height', 'words'), [(0.01, 'below its top'), (-0.02, 'lighter than foam')])
+def test_a_table_at_a_wrong_height_is_named(lying, height, words):
+    warning, = observation_warnings(lying, height, 0.03)
+    assert words in warning
+    assert 'table_height' in warning
+
+
+def test_a_dlo_of_unknown_mass_may_be_as_thick_as_it_lies_high(lying):
+    assert observation_warnings(lying, -0.02) == ()

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The capture page in a real browser: what a person does with mouse and keys, and what then is to be seen."""
+"""The capture page in a real browser: what a person does with mouse and keys, and what the page shows."""
 
 import re
 import time
@@ -24,6 +24,7 @@ import cv2
 import numpy as np
 import pytest
 
+from dlo_calibration.model.parameters import interval
 from dlo_calibration.page import information
 from dlo_calibration.simulation.compiled import CompiledSimulator
 
@@ -45,7 +46,7 @@ def chromium():
 
 @pytest.fixture(scope='module')
 def server(tmp_path_factory, chromium):
-    """Give the server, of which each test has the project to itself."""
+    """Give the server; `empty` empties its project for each test."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(information, 'LiveInformation', ToyInformation)
         with served(tmp_path_factory.mktemp('browser') / 'project', '--evaluations', 12, '--calibrate',
@@ -62,7 +63,7 @@ def empty(server):
 
 @pytest.fixture
 def opened(chromium, empty):
-    """Give a function that opens the page; it complains about nothing but refusals."""
+    """Give a function that opens the page; its console may report nothing but refusals."""
     tabs = []
 
     def tab(size=DESKTOP, **how):
@@ -70,9 +71,9 @@ def opened(chromium, empty):
         return tabs[-1]
 
     yield tab
-    for one in tabs:
-        one.close()
-    assert [text for one in tabs for text in one.complaints if 'Failed to load' not in text] == []
+    for window in tabs:
+        window.close()
+    assert [text for window in tabs for text in window.complaints if 'Failed to load' not in text] == []
 
 
 @pytest.fixture
@@ -87,17 +88,17 @@ def prepared(empty):
 def scaled(document):
     """Give all photographs of a document their scale."""
     document['dlo']['diameter'] = DIAMETER
-    for one in document['photographs']:
-        one['scale'] = SCALE
+    for photograph in document['photographs']:
+        photograph['scale'] = SCALE
 
 
 def seen(check):
-    """Wait until what is checked is there; return it."""
+    """Wait until a check returns a true value; return it."""
     begun = time.monotonic()
-    while not (found := check()):
+    while not (value := check()):
         assert time.monotonic() - begun < PATIENCE
         time.sleep(0.03)
-    return found
+    return value
 
 
 def entry(server, k=0):
@@ -105,9 +106,9 @@ def entry(server, k=0):
     return server.state()['document']['photographs'][k]
 
 
-def kept(server, count, k=0):
-    """Return the clicks of a photograph when there are so many."""
-    return seen(lambda: (found := entry(server, k)['clicks']) and len(found) == count and found)
+def saved_clicks(server, count, k=0):
+    """Return the clicks of a photograph once there are `count`."""
+    return seen(lambda: (saved := entry(server, k)['clicks']) and len(saved) == count and saved)
 
 
 def photographs(folder):
@@ -119,10 +120,10 @@ def photographs(folder):
 
 def test_a_whole_trial_from_upload_to_result(opened, empty, tmp_path):
     tab = opened()
-    found = {'empty': tab.violations()}
+    violations = {'empty': tab.violations()}
     tab.find('input[type=file]').first.set_input_files(photographs(tmp_path))
     tab.find('.photographs li').nth(1).wait_for()
-    found['photographs'] = tab.violations()
+    violations['photographs'] = tab.violations()
     tab.button('Next: Scale').click()
     tab.field('Four or more points').click()
     for k, corner in enumerate(CORNERS):
@@ -133,43 +134,121 @@ def test_a_whole_trial_from_upload_to_result(opened, empty, tmp_path):
             tab.keys('Tab')
     tab.find('.outcome').wait_for()
     assert tab.find('.line.grid').count() > 5
-    found['scale'] = tab.violations()
+    violations['scale'] = tab.violations()
     tab.button('same scale for all').click()
     tab.button('Next: DLO').click()
     for role, line in (('Start', START), ('Goal', GOAL)):
         tab.photograph(role)
         tab.clicked(clicks(line))
         tab.find('.line.sure').first.wait_for()
-        found[role] = tab.violations()
+        violations[role] = tab.violations()
     tab.button('Next: Hands').click()
     tab.button('Drag').click()
     tab.find('.line.way').first.wait_for()
     tab.drag(START[100], START[-1])
     seen(lambda: empty.state()['document']['trials'][0]['steps'][0]['fraction'] > 0.95)
-    found['hands'] = tab.violations()
+    violations['hands'] = tab.violations()
     tab.button('Next: Calibrate').click()
-    tab.find('.shows').wait_for()  # what the trial tells before anything is calibrated
+    tab.find('.shows').wait_for()  # the information before the calibration
     tab.button('Calibrate').last.click()
     tab.find('table.result').wait_for()
     assert {'flexibility', 'friction'} <= set(tab.find('table.result').inner_text().split())
+    headline = tab.find('[aria-label="Result"] > *').nth(1).inner_text()
+    assert headline == empty.state()['calibration']['result']['headline']
+    assert 'the simulated points are' in headline.lower()
     simulated = tab.find('.line.simulated polyline').first
     simulated.wait_for()
     at_goal = simulated.get_attribute('points')
     tab.field('Film of the simulated DLO').last.fill('0')
     tab.find('output:has-text("0.0 s")').wait_for()
     assert simulated.get_attribute('points') != at_goal
-    found['result'] = tab.violations()
+    violations['result'] = tab.violations()
     with tab.page.expect_download() as download:
         tab.find('a[href$="session.mcap"]').click()
     assert download.value.path().stat().st_size > 1000
-    assert {name: one for name, one in found.items() if one} == {}
+    assert {step: faults for step, faults in violations.items() if faults} == {}
+
+
+def test_a_narrow_interval_stays_visible_and_is_written_with_one_power_of_ten(opened, empty):
+    estimate = {'value': 41.2, 'std': 0.1, 'lower': 41.0, 'upper': 41.4, 'physical_value': 1.02e-4,
+                'physical_lower': 9.23e-5, 'physical_upper': 1.12e-4, 'physical_unit': 'N m^2',
+                'identifiable': True, 'verdict': 'identifiable', 'note': ''}
+    ends = {'lower': 0.0, 'upper': 0.2, 'value': 0.1}, {}, {'lower': 99.8, 'upper': 100.0, 'value': 99.9}
+    names = 'friction', 'flexibility', 'damping'
+    result = {'headline': 'Usable: yes.', 'unusable': '', 'sentences': [], 'warnings': [],
+              'parameters': {name: {**estimate, **end} for name, end in zip(names, ends, strict=True)}}
+
+    def answer(route):
+        state = route.fetch().json()
+        state['calibration'].update(state='done', result=result)
+        route.fulfill(json=state)
+
+    tab = opened()
+    tab.page.route('**/api/state', answer)
+    tab.page.reload()
+    tab.step('Calibrate')
+    tab.find('.headline.good').wait_for()
+    for bar in tab.find('svg.bar').all():
+        whole, mark, value = (bar.locator(part).bounding_box() for part in ('.whole', '.interval', '.value'))
+        assert mark['width'] > 3 * value['width']
+        assert mark['height'] > 1.5 * whole['height']
+        for inside in (mark, value):
+            assert whole['x'] - 0.1 <= inside['x'] <= whole['x'] + whole['width'] - inside['width'] + 0.1
+    text = tab.find('table.result').inner_text()
+    assert '1.02e-4 N m²' in text and '0.923e-4 to 1.12e-4 N m²' in text
+    assert tab.violations() == []
+
+
+@pytest.mark.parametrize(('lower', 'upper', 'text'), [
+    (9.5e-4, 1.1e-3, '0.00095 to 0.0011 N'), (5e5, 2e6, '0.5e6 to 2e6 N'), (0.0, 1.12e-4, '0 to 1.12e-4 N'),
+    (-2e-4, 1e-4, '-2e-4 to 1e-4 N'), (3.16e-6, 0.1, '0.00000316 to 0.1 N'), (12.0, 1897.0, '12 to 1900 N')])
+def test_the_page_writes_intervals_as_the_reports_do(opened, lower, upper, text):
+    words = opened().page.evaluate(
+        "async ends => (await import('./page/words.js')).interval(...ends, 'N')", [lower, upper])
+    assert words == interval(lower, upper, 'N') == text
+
+
+def test_what_is_missing_is_said_once(opened, prepared):
+    tab = opened()
+    tab.step('DLO')
+    tab.clicked(clicks(START))
+    tab.find('.line.sure').first.wait_for()
+    assert tab.find('.missing').inner_text() == 'Still missing: the DLO at the goal of trial 1.'
+    assert 'goal photograph' not in tab.find('.panel').inner_text()
+    tab.step('Calibrate')
+    missing = tab.find('.missing')
+    assert missing.count() == 1
+    assert missing.locator('li').all_inner_texts() == [
+        'Click along the DLO in the goal photograph, from one end to the other.',
+        'Say what the hand did between the two photographs.']
+    assert missing.locator('button').all_inner_texts() == ['Go to the DLO', 'Go to the hands']
+    assert tab.find('.warnings').count() == 0
+    assert tab.violations() == []
+    tab.button('Go to the hands').click()
+    tab.page.get_by_role('heading', name='Hands', level=2).wait_for()
+    assert tab.find('.missing').inner_text() == 'Still missing: what the hand did in trial 1.'
+
+
+def test_next_waits_until_all_photographs_are_added(opened, empty, tmp_path):
+    tab = opened()
+    uploads, following = [], tab.button('Next: Scale')
+    tab.page.route('**/api/photographs', lambda route: uploads.append(route))
+    tab.find('input[type=file]').first.set_input_files(photographs(tmp_path))
+    for words in ('2 photographs are', '1 photograph is'):
+        waiting = tab.find(f'.onward:has-text("Wait until {words} added.")')
+        seen(lambda waiting=waiting: waiting.count() and uploads)
+        assert following.is_disabled()
+        assert tab.violations() == []
+        uploads.pop().continue_()
+    tab.find('.onward .note').wait_for(state='detached')
+    assert following.is_enabled()
 
 
 def test_clicks_are_dragged_nudged_inserted_and_removed_and_all_of_it_is_undone(opened, prepared):
     tab = opened()
     tab.step('DLO')
     tab.clicked(clicks(START))
-    first = kept(prepared, 4)
+    first = saved_clicks(prepared, 4)
     tab.drag(first[1], (first[1][0] + 20, first[1][1]))
     dragged = seen(lambda: (now := entry(prepared)['clicks'])[1][0] > first[1][0] + 15 and now)
     tab.mark('click 2').focus()
@@ -178,15 +257,15 @@ def test_clicks_are_dragged_nudged_inserted_and_removed_and_all_of_it_is_undone(
     seen(lambda: entry(prepared)['clicks'][2] == pytest.approx([u + 1, v + 10], abs=0.01))
     tab.mark('click 0').focus()
     tab.keys('Delete')
-    kept(prepared, 3)
+    saved_clicks(prepared, 3)
     tab.find('.outcome:has-text("3 clicks")').wait_for()
-    tab.drag(START[100], START[100] + [0, 15])  # the line is taken between two clicks
+    tab.drag(START[100], START[100] + [0, 15])  # the line, between two clicks
     seen(lambda: [*entry(prepared)['clicks'], None][1] == pytest.approx(list(START[100] + [0, 15]), abs=1.5))
-    assert kept(prepared, 4)[0] == dragged[1]
+    assert saved_clicks(prepared, 4)[0] == dragged[1]
     for count in (3, 4):
         tab.keys('Control+z')
-        kept(prepared, count)
-    tab.keys('Control+z')  # nudges that follow each other are one step
+        saved_clicks(prepared, count)
+    tab.keys('Control+z')  # successive nudges are one step
     seen(lambda: entry(prepared)['clicks'] == dragged)
     tab.button('Undo').click()  # a whole drag, too
     seen(lambda: entry(prepared)['clicks'] == first)
@@ -213,8 +292,8 @@ def test_the_stage_is_busy_until_the_photograph_is_shown(opened, prepared):
     tab.step('DLO')
     tab.photograph('Goal')
     assert tab.find('#stage').get_attribute('aria-busy') == 'true'
-    for one in held:
-        one.continue_()
+    for route in held:
+        route.continue_()
     tab.page.unroute(PICTURE)
     tab.find('#stage[aria-busy="false"]').wait_for()
     assert tab.find('#pictures img').get_attribute('src').startswith(
@@ -235,7 +314,7 @@ def test_which_strand_is_above_is_asked_at_the_crossing(opened, empty):
     tab.mark('crossing 0').focus()
     tab.keys('Enter')
     tab.button('A (blue)').click()
-    seen(lambda: [one['first_above'] for one in entry(empty)['crossings']] == [True])
+    seen(lambda: [answer['first_above'] for answer in entry(empty)['crossings']] == [True])
     assert tab.find('.bubble').count() == 0
 
 
@@ -244,22 +323,22 @@ def test_the_dlo_is_traced_and_a_hand_moved_by_keys_alone(opened, prepared):
     tab.step('DLO')
     tab.find('#stage').focus()
     tab.keys('Enter', *['ArrowRight'] * 3, 'Enter')  # each click is in the middle of the stage
-    two = kept(prepared, 2)
+    two = saved_clicks(prepared, 2)
     assert two[1][0] - two[0][0] > 50
-    prepared.change(lambda document: [one.update(clicks=clicks(line)) for one, line in zip(
+    prepared.change(lambda document: [photograph.update(clicks=clicks(line)) for photograph, line in zip(
         document['photographs'], (START, GOAL), strict=True)])
     tab.step('Hands')
     tab.button('Grasp and place').press('Enter')
     tab.mark('grip 0 0').focus()
     tab.keys('Shift+ArrowRight')
-    seen(lambda: [one['fraction'] for one in prepared.state()['document']['trials'][0]['steps']]
+    seen(lambda: [step['fraction'] for step in prepared.state()['document']['trials'][0]['steps']]
          == [pytest.approx(0.51)])
 
 
 def test_the_place_where_a_hand_opened_and_drawn_waypoints_are_marked(opened, prepared):
     def traced(document):
-        for one, line in zip(document['photographs'], (START, GOAL), strict=True):
-            one['clicks'] = clicks(line)
+        for photograph, line in zip(document['photographs'], (START, GOAL), strict=True):
+            photograph['clicks'] = clicks(line)
     prepared.change(traced)
 
     def steps():
@@ -274,7 +353,7 @@ def test_the_place_where_a_hand_opened_and_drawn_waypoints_are_marked(opened, pr
     tab.field('still holds the DLO').click()
     assert seen(lambda: steps()[0]['hold']) and steps()[0]['to'] is None
     tab.button('Add another movement').click()
-    tab.button('Along a drawn way').click()
+    tab.button('Along a drawn path').click()
     tab.photograph('Start')
     tab.click((125, 250))
     tab.mark('way 1 0').wait_for()
@@ -282,7 +361,7 @@ def test_the_place_where_a_hand_opened_and_drawn_waypoints_are_marked(opened, pr
     tab.mark('way 1 1').wait_for()
     tab.field('Height of place 2 in mm').fill('30')
     tab.keys('Tab')
-    way = seen(lambda: (found := steps()[1]['waypoints']) and found[-1][2] > 0 and found)
+    way = seen(lambda: (places := steps()[1]['waypoints']) and places[-1][2] > 0 and places)
     assert np.allclose(way, [[*table((125, 250)), 0], [*table((187, 262)), 0.03]], atol=2e-3)
 
 
@@ -305,13 +384,13 @@ def test_the_wheel_zooms_under_the_pointer_and_dragging_the_background_moves_it(
 def test_every_step_can_be_read_on_a_dark_telephone(opened, empty):
     whole_trial(empty)
     tab = opened(TELEPHONE, color_scheme='dark', reduced_motion='reduce')
-    found = {}
+    faults = {}
     for name in STEPS:
         tab.step(name)
         if name != 'Photographs':
             tab.find('#pictures img').wait_for()
-        found[name] = tab.violations(), tab.overflow()
-    assert found == {name: ([], 0) for name in STEPS}
+        faults[name] = tab.violations(), tab.overflow()
+    assert faults == {name: ([], 0) for name in STEPS}
 
 
 def test_a_long_name_in_a_warning_does_not_widen_the_panel(opened, empty):
@@ -324,7 +403,7 @@ def test_a_long_name_in_a_warning_does_not_widen_the_panel(opened, empty):
     empty.change(same_scale)
     tab = opened()
     tab.step('Calibrate')
-    tab.find(f'.warnings li:has-text("{"x" * 60}")').first.wait_for()
+    tab.find(f'.missing li:has-text("{"x" * 60}")').first.wait_for()
     assert tab.overflow() == 0
 
 
@@ -332,7 +411,7 @@ def test_a_reopened_page_shows_the_project_and_a_second_window_the_newest_state(
     first = opened()
     first.step('DLO')
     first.clicked(clicks(START)[:2])
-    kept(prepared, 2)
+    saved_clicks(prepared, 2)
     second = opened()
     second.step('DLO')
     second.mark('click 1').wait_for()
@@ -340,7 +419,7 @@ def test_a_reopened_page_shows_the_project_and_a_second_window_the_newest_state(
     first.mark('click 2').wait_for()
     first.find('.notice').wait_for()
     first.clicked(clicks(START)[3:])
-    assert len(kept(prepared, 4)) == 4
+    assert len(saved_clicks(prepared, 4)) == 4
     first.page.reload()
     first.step('DLO')
     first.mark('click 3').wait_for()
@@ -365,7 +444,7 @@ def test_changes_without_connection_are_kept_and_sent_later(opened, prepared):
     tab.find('.lost').wait_for()
     tab.mark('click 0').wait_for()
     tab.context.set_offline(False)
-    assert len(kept(prepared, 1)) == 1
+    assert len(saved_clicks(prepared, 1)) == 1
     seen(lambda: tab.find('.lost').count() == 0)
 
 

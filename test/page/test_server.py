@@ -15,11 +15,11 @@ import urllib.request
 import zlib
 
 from capture_page import (
-    apart,
     clicks,
     DIAMETER,
     drawn,
     GOAL,
+    page_process,
     PATIENCE,
     PER_METRE,
     served,
@@ -41,7 +41,7 @@ pytestmark = pytest.mark.usefixtures('without_drawings')
 
 @pytest.fixture(scope='module')
 def shared(tmp_path_factory):
-    """Give a page that tests leave as it is: empty."""
+    """Give a page with an empty project, which tests do not change."""
     with served(tmp_path_factory.mktemp('shared') / 'project') as page:
         yield page
 
@@ -63,30 +63,30 @@ def test_two_photographs_make_a_trial(tmp_path):
         goal = page.add(drawn(GOAL, '.jpg'), 'goal.jpg')
         third = page.add(drawn(GOAL), 'third.png')
         state = page.state()
-        assert [one['name'] for one in state['document']['photographs']] == [
+        assert [photograph['name'] for photograph in state['document']['photographs']] == [
             'start.png', 'goal.jpg', 'third.png']
-        assert [(one['start'], one['goal']) for one in state['document']['trials']] == [
+        assert [(trial['start'], trial['goal']) for trial in state['document']['trials']] == [
             (start, goal), (goal, third)]
-        assert not any(one['complete'] for one in state['trials'])
+        assert not any(trial['complete'] for trial in state['trials'])
         assert state['photographs'][start]['width'] == 400
 
 
 def test_clicks_become_a_chain_in_metres(finished):
     page, _, state = finished
-    start, goal = (one['id'] for one in state['document']['photographs'])
-    found = state['photographs'][start]
-    assert found['scale']['residual'] < 1e-4
+    start, goal = (photograph['id'] for photograph in state['document']['photographs'])
+    measured = state['photographs'][start]
+    assert measured['scale']['residual'] < 1e-4
     length = np.linalg.norm(np.diff(START, axis=0), axis=1).sum() / PER_METRE
     # The photograph is too small for the tracer to be exact.
-    assert found['trace']['length'] == pytest.approx(length, abs=0.03)
-    rows = np.array([[float(one) for one in row] for row in csv.reader(
+    assert measured['trace']['length'] == pytest.approx(length, abs=0.03)
+    rows = np.array([list(map(float, row)) for row in csv.reader(
         page.get(f'api/files/{start}.csv').decode().splitlines())])
     assert rows.shape == (21, 3)
     assert rows[:, 2] == pytest.approx(DIAMETER / 2, abs=1e-3)
     assert b'<point ' in page.get(f'api/files/{goal}.xml')
 
 
-def test_the_result_is_what_fit_finds_in_the_saved_session(finished, tmp_path, command):
+def test_the_result_is_that_of_fit_on_the_saved_session(finished, tmp_path, command):
     page, folder, state = finished
     shown = state['calibration']['result']
     assert state['calibration']['state'] == 'done'
@@ -95,8 +95,8 @@ def test_the_result_is_what_fit_finds_in_the_saved_session(finished, tmp_path, c
     for name in ('session.mcap', 'request.xml'):
         saved = tmp_path / name
         saved.write_bytes(page.get(f'api/files/{name}'))
-        _, found, _ = command('fit', saved, '--json')
-        assert {name: found[name] for name in ('parameters', 'score')} == {
+        _, result, _ = command('fit', saved, '--json')
+        assert {name: result[name] for name in ('parameters', 'score')} == {
             name: shown[name] for name in ('parameters', 'score')}
     assert command('fit', folder / 'result' / 'session.mcap', '--json')[1]['score'] == shown['score']
 
@@ -110,14 +110,14 @@ def test_the_result_has_files(finished):
 
 def test_the_film_ends_near_the_goal(finished):
     page, _, state = finished
-    start, goal = (one['id'] for one in state['document']['photographs'])
+    start, goal = (photograph['id'] for photograph in state['document']['photographs'])
     film = json.loads(page.get(f'api/film/0?photograph={goal}'))
     pixels = np.array(film['pixels'])
     assert pixels.shape == (len(film['times']), 21, 2)
     assert film['names'] == ['left_hand']
     assert film['hands'][film['goal']] == [None]
-    holds = next(one for one in film['hands'] if one[0] is not None)
-    assert holds[0] == pytest.approx(state['trials'][0]['hands'][0]['grip'], abs=5)
+    holds = next(hands for hands in film['hands'] if hands[0] is not None)
+    assert holds[0] == pytest.approx(state['trials'][0]['hands'][0]['start_pixels'][0], abs=5)
     assert page.refused('GET', f'api/film/1?photograph={goal}')[0] == 400
     assert page.refused('GET', 'api/film/0?photograph=../../et')[0] == 404
 
@@ -128,8 +128,8 @@ def test_a_reopened_project_has_everything(finished, tmp_path):
     with served(copy) as again:
         after = again.state()
         assert after['document'] == before['document']
-        for one, found in after['photographs'].items():
-            assert found['trace']['pixels'] == before['photographs'][one]['trace']['pixels']
+        for identity, measured in after['photographs'].items():
+            assert measured['trace']['pixels'] == before['photographs'][identity]['trace']['pixels']
         assert after['calibration']['result'] == before['calibration']['result']
         assert after['calibration']['state'] == 'done'
         assert after['calibration']['files'] == before['calibration']['files']
@@ -139,14 +139,14 @@ def test_a_reopened_project_has_everything(finished, tmp_path):
         assert state['calibration']['result']['outdated']
 
 
-def test_a_result_whose_files_are_of_another_is_shown_without_them(finished, tmp_path):
+def test_a_result_is_shown_without_the_files_of_another_result(finished, tmp_path):
     copy = shutil.copytree(finished[1], tmp_path / 'copy')
     text = (copy / 'result' / 'result.json').read_text()
     score = finished[2]['calibration']['result']['score']
     (copy / 'result' / 'result.json').write_text(text.replace(f'{score!r}', '1.5'))
-    found = ProjectCalibration(copy, new_toy, {})
-    assert found.plain_result('')['score'] == 1.5
-    assert (found.files, found.description) == ((), None)
+    calibration = ProjectCalibration(copy, new_toy, {})
+    assert calibration.plain_result('')['score'] == 1.5
+    assert (calibration.files, calibration.description) == ((), None)
 
 
 def test_no_link_in_a_folder_is_followed(finished, tmp_path):
@@ -154,28 +154,28 @@ def test_no_link_in_a_folder_is_followed(finished, tmp_path):
     (tmp_path / 'secret').write_text('secret')
     (copy / 'result' / 'report.html').unlink()
     (copy / 'result' / 'report.html').symlink_to(tmp_path / 'secret')
-    found = ProjectCalibration(copy, new_toy, {})
-    assert set(found.files) == {'result.xml', 'session.mcap', 'evaluations.csv'}
+    calibration = ProjectCalibration(copy, new_toy, {})
+    assert set(calibration.files) == {'result.xml', 'session.mcap', 'evaluations.csv'}
 
 
 @pytest.mark.parametrize('content', [
     b'', b'{"result": [[[[', b'[' * 100000, b'\xff', b'[]', b' ' * (2**22 + 1),
     b'{"result": {"parameters": 3}, "digest": "", "state": "done"}'])
-def test_what_a_stranger_put_into_the_result_is_ignored(tmp_path, content):
+def test_a_result_from_a_stranger_is_ignored_if_it_is_damaged(tmp_path, content):
     (tmp_path / 'result').mkdir()
     (tmp_path / 'result' / 'result.json').write_bytes(content)
-    found = ProjectCalibration(tmp_path, new_toy, {})
-    assert (found.state, found.plain_result('')) == ('idle', None)
+    calibration = ProjectCalibration(tmp_path, new_toy, {})
+    assert (calibration.state, calibration.plain_result('')) == ('idle', None)
 
 
-def test_each_trial_tells_what_it_adds_before_anything_is_calibrated(tmp_path, monkeypatch):
+def test_the_information_of_each_trial_is_shown_before_a_calibration(tmp_path, monkeypatch):
     monkeypatch.setattr(information, 'LiveInformation', ToyInformation)
     with served(tmp_path, '--calibrate', 'flexibility', appraising=True) as page:
         whole_trial(page)
         state = page.until(lambda state: state['trials'][0]['information'], 'the information')
-        found = state['trials'][0]['information']
-        assert found['parameters'] == {'flexibility': {'before': 30.0, 'after': 6.0}}
-        assert found['sentence'].startswith('trial 1 makes flexibility more certain')
+        appraised = state['trials'][0]['information']
+        assert appraised['parameters'] == {'flexibility': {'before': 30.0, 'after': 6.0}}
+        assert appraised['sentence'].startswith('trial 1 makes flexibility more certain')
         assert state['calibration']['state'] == 'idle'
 
 
@@ -221,7 +221,7 @@ def test_the_second_of_two_windows_does_not_undo_the_first(tmp_path):
     with served(tmp_path) as page:
         old = page.state()
         page.change(lambda document: document['dlo'].update(mass=0.03))
-        late = {one: old[one] for one in ('revision', 'document')}
+        late = {name: old[name] for name in ('revision', 'document')}
         status, _, answer = page.ask('PUT', 'api/document', late)
         assert status == 409
         assert json.loads(answer)['state']['document']['dlo']['mass'] == 0.03
@@ -240,7 +240,7 @@ def test_a_file_that_is_no_photograph_is_refused(shared, octets, word):
     assert shared.state()['document']['photographs'] == []
 
 
-def test_a_bomb_costs_nothing(shared):
+def test_a_huge_picture_is_refused_before_it_is_decoded(shared):
     head = struct.pack('>IIBBBBB', 20000, 10000, 8, 2, 0, 0, 0)
     bomb = b'\x89PNG\r\n\x1a\n' + b''.join(
         struct.pack('>I', len(data)) + kind + data + struct.pack('>I', zlib.crc32(kind + data))
@@ -250,8 +250,9 @@ def test_a_bomb_costs_nothing(shared):
 
 
 def test_too_large_uploads_are_refused(shared):
-    assert shared.refused('POST', 'api/photographs', bytes(64 * 2**20 + 1))[0] == 413
-    assert shared.refused('PUT', 'api/document', b' ' * (2 * 2**20 + 1))[0] == 413
+    for method, path, size in (('POST', 'api/photographs', 64 * 2**20), ('PUT', 'api/document', 2 * 2**20)):
+        status, sentence = shared.refused(method, path, bytes(size + 1))
+        assert (status, 'send a smaller file' in sentence) == (413, True), sentence
 
 
 @pytest.mark.parametrize('content, kind, status', [
@@ -294,19 +295,19 @@ def test_an_upload_that_ends_early_writes_nothing_to_the_terminal(shared, caplog
     assert caplog.records == []
 
 
-def test_a_trial_without_what_it_needs_is_not_calibrated(shared):
+def test_an_incomplete_trial_is_not_calibrated(shared):
     assert 'no complete trial' in shared.refused('POST', 'api/calibrate')[1]
     for name in ('session.mcap', 'result.xml', 'report.html'):
         assert shared.refused('GET', f'api/files/{name}')[0] == 400
     assert shared.refused('POST', 'api/calibrate', {'workers': 3})[0] == 400
 
 
-def test_clicks_beside_the_rope_or_outside_the_photograph_are_problems_of_the_trace(tmp_path):
+def test_clicks_beside_the_rope_or_outside_the_photograph_are_refused_or_unsure(tmp_path):
     with served(tmp_path) as page:
         empty = page.add(drawn(None))
         state = page.change(lambda document: document['photographs'][0].update(clicks=clicks(START)))
-        found = state['photographs'][empty]
-        assert found['trace_problem'] or not all(found['trace']['sure'])
+        measured = state['photographs'][empty]
+        assert measured['trace_problem'] or not all(measured['trace']['sure'])
         outside = [[9e3, 9e3], [5.0, 5.0]]
         state = page.change(lambda document: document['photographs'][0].update(clicks=outside))
         assert '400 x 300' in state['photographs'][empty]['trace_problem']
@@ -320,7 +321,7 @@ def test_other_pages_are_refused(shared, headers):
     assert shared.refused('GET', 'api/state', None, headers)[0] == 403
 
 
-def test_nothing_is_there_without_the_token(shared):
+def test_an_address_without_the_token_is_not_found(shared):
     base = shared.address.rstrip('/').rpartition('/')[0]
     shorter = shared.address[:-2].removeprefix(base)
     for path in ('/', '/api/state', '/page/main.js', '//', '/x/api/state', shorter):
@@ -330,7 +331,7 @@ def test_nothing_is_there_without_the_token(shared):
 @pytest.mark.parametrize('path', [
     'page/..%2fserver.py', 'page/%2e%2e/server.py', 'api/files/..%2fproject.json', 'api/files/project.json',
     'api/photographs/..%2f..%2fx/picture', 'api/board/a5.pdf', 'api/film/x', 'api/nothing', 'api/files/'])
-def test_no_name_is_a_path(shared, path):
+def test_names_never_lead_to_other_files(shared, path):
     assert shared.refused('GET', path)[0] == 404
 
 
@@ -347,17 +348,17 @@ def test_every_answer_keeps_other_pages_out(finished):
 
 def test_pictures_have_the_width_that_is_asked_for(tmp_path):
     with served(tmp_path) as page:
-        one = page.add(drawn(START))
+        identity = page.add(drawn(START))
         for width, expected in ((160, 160), (5000, 400), (None, 400)):
             query = '' if width is None else f'?width={width}'
-            octets = page.get(f'api/photographs/{one}/picture{query}')
+            octets = page.get(f'api/photographs/{identity}/picture{query}')
             pixels = cv2.imdecode(np.frombuffer(octets, np.uint8), cv2.IMREAD_COLOR)
             assert pixels.shape == (expected * 3 // 4, expected, 3)
             place = START[100] * expected / 400
             blue, _, red = pixels[round(place[1]), round(place[0])].astype(int)
             assert red > blue + 60
-        assert page.refused('GET', f'api/photographs/{one}/picture?width=-3')[0] == 400
-        assert page.refused('GET', f'api/photographs/{one}/picture?width=1')[0] == 400
+        assert page.refused('GET', f'api/photographs/{identity}/picture?width=-3')[0] == 400
+        assert page.refused('GET', f'api/photographs/{identity}/picture?width=1')[0] == 400
 
 
 def test_a_camera_calibration_is_used_and_can_be_removed(tmp_path):
@@ -383,18 +384,19 @@ def test_the_board_can_be_printed_from_the_page_and_the_command_line(shared, tmp
 def test_kill_loses_nothing_and_a_signal_ends_it_well(tmp_path):
     folder = tmp_path / 'project'
     words = '--evaluations', 100000, '--search', 'random', '--workers', 1
-    with apart(folder, *words) as (page, process):
+    with page_process(folder, *words) as (page, process):
         before = whole_trial(page)
         page.done('POST', 'api/calibrate')
         page.until(lambda state: state['calibration']['evaluations'] > 1)
         process.kill()
         process.wait()
-    with apart(folder, *words, '--host', '0.0.0.0') as (page, process):
+    with page_process(folder, *words, '--host', '0.0.0.0') as (page, process):
         after = page.state()
         assert after['document'] == before['document']
         assert after['trials'][0]['complete']
         page.done('POST', 'api/calibrate')
-        page.until(lambda state: any('goes on after' in one for one in state['calibration']['warnings']))
+        page.until(lambda state: any(
+            'goes on after' in warning for warning in state['calibration']['warnings']))
         process.send_signal(signal.SIGTERM)
         warning, *rest = process.communicate(timeout=PATIENCE)[1].splitlines()
         assert process.returncode == 0
@@ -404,17 +406,17 @@ def test_kill_loses_nothing_and_a_signal_ends_it_well(tmp_path):
 
 
 def refusal_of(capsys, *words):
-    """Return what the command says that cannot begin."""
+    """Return the refusal of a command that cannot begin."""
     assert cli.main(['capture', '--no-browser', *map(str, words)]) == 2
     line, = capsys.readouterr().err.splitlines()
     return line
 
 
 def test_unusable_input_is_refused_in_one_sentence(tmp_path, capsys):
-    with closing(socket.socket()) as taken:
-        taken.bind(('127.0.0.1', 0))
-        taken.listen()
-        port = taken.getsockname()[1]
+    with closing(socket.socket()) as server:
+        server.bind(('127.0.0.1', 0))
+        server.listen()
+        port = server.getsockname()[1]
         assert str(port) in refusal_of(capsys, tmp_path / 'one', '--port', port)
     assert '0 to 65535' in refusal_of(capsys, tmp_path / 'one', '--port', 99999)
     (tmp_path / 'file').write_text('x')

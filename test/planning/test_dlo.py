@@ -14,7 +14,7 @@ from dlo_calibration.planning import Posterior
 def drawn(dlo, count=4000, seed=1):
     """Return draws on the 0..100 scale, by name."""
     draws = Posterior.of(dlo).draws(count, seed)
-    return {name: np.array([BY_NAME[name].value(one[name]) for one in draws]) for name in ROPE}
+    return {name: np.array([BY_NAME[name].value(draw[name]) for draw in draws]) for name in ROPE}
 
 
 def test_90_percent_of_the_draws_lie_in_the_interval():
@@ -34,12 +34,12 @@ def test_no_draw_is_beyond_the_scale():
 
 def test_draws_are_correlated_as_the_result_says():
     names = list(ROPE)
-    correlations = {one: {other: float(one == other) for other in names} for one in names}
+    correlations = {name: {other: float(name == other) for other in names} for name in names}
     correlations['flexibility']['friction'] = correlations['friction']['flexibility'] = -0.9
     values = drawn(MadeUpDlo(correlations=correlations))
-    found = np.corrcoef([values[name] for name in names])
-    assert found[0, 2] == pytest.approx(-0.9, abs=0.03)
-    assert found[0, 1] == pytest.approx(0, abs=0.05)
+    measured = np.corrcoef([values[name] for name in names])
+    assert measured[0, 2] == pytest.approx(-0.9, abs=0.03)
+    assert measured[0, 1] == pytest.approx(0, abs=0.05)
 
 
 def test_draws_depend_on_the_seed_alone():
@@ -49,7 +49,7 @@ def test_draws_depend_on_the_seed_alone():
     assert posterior.draws(8, 3)[:5] == posterior.draws(5, 3)
 
 
-def test_the_best_parameters_are_those_found():
+def test_the_best_parameters_are_those_of_the_result():
     best = Posterior.of(MadeUpDlo()).best
     assert best['friction'] == pytest.approx(BY_NAME['friction'].physical(70.0))
     assert best['mass'] == 0.03

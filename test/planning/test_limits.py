@@ -25,12 +25,12 @@ PLACES = st.tuples(COORDINATES, COORDINATES, COORDINATES).map(np.array)
 
 
 def along(begin, end):
-    """Return many places of a straight way, and how far apart they are."""
+    """Return many places of a straight way, and the distance between neighbours [m]."""
     places = begin + np.linspace(0, 1, SAMPLES)[:, None] * (end - begin)
     return places, float(np.linalg.norm(end - begin)) / (SAMPLES - 1)
 
 
-def one(answer):
+def single(answer):
     """Return the answer about a single way."""
     assert answer.shape == (1,)
     return bool(answer[0])
@@ -40,28 +40,28 @@ def one(answer):
 @given(PLACES, PLACES, PLACES, PLACES)
 def test_a_way_enters_a_box_if_one_of_its_places_does(corner, other, begin, end):
     box = Box.between(np.concatenate([corner, other]))
-    places, apart = along(begin, end)
+    places, spacing = along(begin, end)
     outside = np.maximum(box.lower - places, places - box.upper).max(axis=1)  # 0 or less: inside
-    entered = one(box.entered(begin[None], end[None]))
+    entered = single(box.entered(begin[None], end[None]))
     if (outside <= 0).any():
         assert entered
-    if entered:  # then a place between two samples does
-        assert outside.min() <= apart + 2e-9
-    assert one(box.contains(begin[None], end[None])) == (outside <= 1e-9).all()
-    assert entered == one(box.entered(end[None], begin[None]))
+    if entered:  # then a place between two samples is inside
+        assert outside.min() <= spacing + 2e-9
+    assert single(box.contains(begin[None], end[None])) == (outside <= 1e-9).all()
+    assert entered == single(box.entered(end[None], begin[None]))
 
 
 @drawing(60)
 @given(PLACES, PLACES, st.integers(0, 10), st.integers(1, 10))
 def test_a_way_keeps_to_an_annulus_if_all_its_places_do(begin, end, inner, width):
     ring = Annulus(np.array([0.1, -0.2]), inner / 10, (inner + width) / 10)
-    places, apart = along(begin, end)
+    places, spacing = along(begin, end)
     radii = np.linalg.norm(places[:, :2] - ring.centre, axis=1)
-    contained = one(ring.contains(begin[None], end[None]))
+    contained = single(ring.contains(begin[None], end[None]))
     if contained:
         assert (radii >= ring.inner - 2e-9).all() and (radii <= ring.outer + 2e-9).all()
     else:
-        assert radii.min() < ring.inner + apart or radii.max() > ring.outer
+        assert radii.min() < ring.inner + spacing or radii.max() > ring.outer
 
 
 @drawing(30)
@@ -70,7 +70,7 @@ def test_many_ways_are_judged_as_each_by_itself(ways, corner, other):
     begin, end = (np.array(places) for places in zip(*ways, strict=True))
     box, ring = Box.between(np.concatenate([corner, other])), Annulus(corner[:2], 0.3, 0.9)
     for judge in (box.entered, box.contains, ring.contains):
-        assert judge(begin, end).tolist() == [one(judge(a[None], b[None])) for a, b in ways]
+        assert judge(begin, end).tolist() == [single(judge(a[None], b[None])) for a, b in ways]
 
 
 def action(*ways):
@@ -82,7 +82,7 @@ def action(*ways):
 LIFTED = [(0.5, 0, 0), (0.5, 0, 0.1), (-0.5, 0, 0.1), (-0.5, 0, 0)]  # over the origin, 0.1 m above the table
 
 
-@pytest.mark.parametrize('options, told', [
+@pytest.mark.parametrize('options, refusal', [
     ({}, ''),
     ({'reach_1': 'annulus 0 0 0.2 0.8'}, 'hand_1 leaves its reach, annulus 0 0 0.2 0.8'),
     ({'reach_1': 'annulus 0 0 0 0.5'}, ''),
@@ -93,8 +93,8 @@ LIFTED = [(0.5, 0, 0), (0.5, 0, 0.1), (-0.5, 0, 0.1), (-0.5, 0, 0)]  # over the 
     ({'no_go': ['-0.1 -0.1 0 0.1 0.1 0.09']}, ''),  # the hand passes above
     ({'no_go': ['2 2 2 3 3 3', '0.1 -0.1 0.2 -0.1 0.1 0']},
      'hand_1 enters the no-go box 0.1 -0.1 0.2 -0.1 0.1 0')])
-def test_an_action_is_refused_by_the_limit_that_it_breaks(options, told):
-    assert PlanOptions.of(options).limits.refusal(action(LIFTED)) == told
+def test_an_action_is_refused_by_the_limit_that_it_breaks(options, refusal):
+    assert PlanOptions.of(options).limits.refusal(action(LIFTED)) == refusal
 
 
 def test_each_hand_has_its_own_reach_and_a_hand_that_stays_is_judged_too():
@@ -119,7 +119,7 @@ def test_a_box_is_entered_by_the_dlo_between_its_points_at_any_instant():
     'annulus', 'annulus 0 0 1', 'annulus 0 0 0.2 0.8 1', 'annulus 0 0 a b', 'sphere 0 0 0 1', '0 0 0 1 1 1',
     'annulus 0 0 0.8 0.2', 'annulus 0 0 -1 1', 'annulus 0 0 1 1', 'box ' + 9000 * '1'],
     ids=lambda text: text[:20])
-def test_an_invalid_reach_is_refused_in_one_sentence(text):
+def test_an_invalid_reach_is_refused(text):
     for name in ('reach_1', 'reach_2'):
         with pytest.raises(InputError) as refusal:
             PlanOptions.of({name: text})
@@ -129,7 +129,7 @@ def test_an_invalid_reach_is_refused_in_one_sentence(text):
 
 @pytest.mark.parametrize('text', [
     '1', '0 0 0 1 1', '0 0 0 1 1 1 1', '0 0 0 1 1 x', '0 0 0 1 1 nan', '\x1b[2J'])
-def test_an_invalid_box_is_refused_in_one_sentence(text):
+def test_an_invalid_box_is_refused(text):
     with pytest.raises(InputError) as refusal:
         PlanOptions.of({'no_go': ['0 0 0 1 1 1', text]})
     assert refusal.value.thing == 'parameter no_go'
@@ -209,7 +209,7 @@ def test_the_defaults_of_a_plan_and_the_options_that_no_file_may_set():
     assert PlanOptions().flat() == DEFAULTS
     assert {declaration.of for declaration in DECLARED.values()} == {MACHINE, SEARCH}
     robot = {'height', 'speed', 'reach_1', 'reach_2', 'no_go'}
-    assert {name for name, one in DECLARED.items() if one.of == MACHINE} == {'workers', *robot}
+    assert {name for name in DECLARED if DECLARED[name].of == MACHINE} == {'workers', *robot}
 
 
 @pytest.mark.parametrize('declaration', DECLARED.values(), ids=DECLARED)
@@ -226,7 +226,7 @@ def test_every_option_is_declared_completely(declaration):
 
 
 @drawing(25)
-@given(st.fixed_dictionaries({}, optional={name: values(one) for name, one in DECLARED.items()}))
+@given(st.fixed_dictionaries({}, optional={name: values(DECLARED[name]) for name in DECLARED}))
 def test_flat_and_of_are_inverse(chosen):
     options = PlanOptions.of(chosen)
     assert options.flat() == {**DEFAULTS, **chosen}

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The course of actions shows what happens between the chains of a prediction."""
+"""The motion of a DLO between the chains of a prediction."""
 
 from made_up_dlo import HOSE, MadeUpDlo, straight
 import numpy as np
@@ -44,14 +44,14 @@ def test_a_motion_shows_a_fall(shown):
     assert ((0.02 < heights) & (heights < 0.09)).any()
 
 
-def test_a_motion_knows_when_hands_are_closed(shown):
+def test_a_motion_shows_when_hands_are_closed(shown):
     _, trial, _ = shown
     lift, drag, release = trial.actions
     closed = [{name: closed for name, (_, closed) in hands_at(trial, time).items()} for time in (
         (lift.start + lift.end) / 2, (lift.end + drag.start) / 2, (drag.start + drag.end) / 2,
         (drag.end + release.start) / 2, release.end + 1)]
-    assert [one['a'] for one in closed] == [True, True, True, True, False]
-    assert [one['b'] for one in closed] == [False, False, True, False, False]
+    assert [hands['a'] for hands in closed] == [True, True, True, True, False]
+    assert [hands['b'] for hands in closed] == [False, False, True, False, False]
 
 
 def test_a_long_motion_has_no_more_frames_than_permitted():

@@ -23,11 +23,11 @@ TO = (0.2, 0.1, LEVEL)
 def test_one_hand_moves_as_in_the_named_action(name, named):
     points = straight().points
     move = Move(name, (7,), ('hand_1',), np.array(TO[:2]) - points[7, :2])
-    found, = move.step(points, LEVELS, 0.04, 0.2).action.hands
+    hand, = move.step(points, LEVELS, 0.04, 0.2).action.hands
     expected, = named.action(straight()).hands
-    np.testing.assert_allclose(found.positions, expected.positions, atol=1e-12)
-    np.testing.assert_allclose(found.times, expected.times, atol=1e-12)
-    assert (found.name, found.grips) == (expected.name, expected.grips)
+    np.testing.assert_allclose(hand.positions, expected.positions, atol=1e-12)
+    np.testing.assert_allclose(hand.times, expected.times, atol=1e-12)
+    assert (hand.name, hand.grips) == (expected.name, expected.grips)
 
 
 def test_two_hands_arrive_together_and_the_faster_one_has_the_speed():
@@ -64,13 +64,13 @@ def test_a_move_without_displacement_only_lifts():
 
 def test_moves_carry_points_to_their_places_in_the_goal():
     start, goal = straight().points, straight().points + [0.1, 0.2, 0.0]
-    one = carrying(start, goal, ('drag',), 1)
-    assert {choices[0].grips for choices in one} >= {(0,), (10,), (20,)}
-    assert all(len(choices) == 1 for choices in one)
-    two = carrying(start, goal, ('drag', 'grasp_and_place'), 2)
-    assert {choices[0].name for choices in two} == {'drag', 'grasp_and_place'}
-    assert (0, 20) in {choices[0].grips for choices in two}
-    for choices in two:
+    single = carrying(start, goal, ('drag',), 1)
+    assert {choices[0].grips for choices in single} >= {(0,), (10,), (20,)}
+    assert all(len(choices) == 1 for choices in single)
+    paired = carrying(start, goal, ('drag', 'grasp_and_place'), 2)
+    assert {choices[0].name for choices in paired} == {'drag', 'grasp_and_place'}
+    assert (0, 20) in {choices[0].grips for choices in paired}
+    for choices in paired:
         assert len({move.hands for move in choices}) == 2
         for move in choices:
             np.testing.assert_allclose(move.shifts, np.tile([0.1, 0.2], (len(move.grips), 1)))
@@ -117,7 +117,7 @@ def test_refinement_solves_a_linear_problem_at_once():
     assert tried == 3 + 3 + 3
 
 
-def test_refinement_goes_on_where_some_points_are_impossible():
+def test_refinement_continues_where_some_points_are_impossible():
     def half_plane(point):
         x, y = point - [0.05, 0.02]
         return None if x > 0.0005 else np.array([x, 2 * y, x])

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Predictions and plans as plain values: what JSON says is what was predicted."""
+"""Predictions and plans as plain values for JSON."""
 
 import json
 
@@ -22,10 +22,10 @@ PLAN_KEYS = {'actions', 'error_before_m', 'error_after_m', 'error_after_percent_
 def test_a_prediction_becomes_json():
     prediction = simulate(MadeUpDlo(), straight(), [
         TwoHands(points=(0, 20), distance=0.05), Drag(point=10, to=(0.3, 0.1, 0.004))], draws=2)
-    told = plain_prediction(prediction)
-    assert json.loads(json.dumps(told, allow_nan=False)) == told
-    first, second = told['actions']
-    assert (first['name'], second['name'], told['draws'], told['remarks']) == ('two_hands', 'drag', 2, [])
+    plain = plain_prediction(prediction)
+    assert json.loads(json.dumps(plain, allow_nan=False)) == plain
+    first, second = plain['actions']
+    assert (first['name'], second['name'], plain['draws'], plain['remarks']) == ('two_hands', 'drag', 2, [])
     assert (first['held_by'], second['held_by']) == (['left_hand', 'right_hand'], ['right_hand'])
     assert first['settled'] is True
     assert [hand['grip'] for hand in first['hands']] == [0, 20]
@@ -36,9 +36,9 @@ def test_a_prediction_becomes_json():
 
 
 def test_waypoints_begin_at_time_0_of_each_action():
-    told = plain_prediction(simulate(MadeUpDlo(), straight(), [
+    plain = plain_prediction(simulate(MadeUpDlo(), straight(), [
         Drag(point=0, to=(0.0, 0.05, 0.004)), Drag(point=10, to=(0.3, 0.05, 0.004))], draws=0))
-    for action, reached in zip(told['actions'], [(0.0, 0.05), (0.3, 0.05)], strict=True):
+    for action, reached in zip(plain['actions'], [(0.0, 0.05), (0.3, 0.05)], strict=True):
         hand, = action['hands']
         assert hand['waypoints'][0][0] == 0
         assert hand['waypoints'][-1][:3] == pytest.approx((0.5, *reached), abs=0.02)
@@ -55,16 +55,16 @@ def test_a_clamp_that_turns_has_grips_and_orientations():
     np.testing.assert_allclose(hand['orientations'][1], (0, 0, half, half))
 
 
-def test_a_plan_has_the_keys_that_users_know():
+def test_a_plan_has_the_documented_keys():
     start, goal = straight(), Chain(straight().points + (0.0, 0.06, 0.0))
     action = Drag(point=10, direction=(0, 1, 0), distance=0.06).action(start)
     planned = PlannedAction('drag', action, goal.points, goal.points - 0.001, goal.points + 0.001)
-    told = plain_plan(Plan(start, goal, (planned,), 0.06, 0.003, float('nan'), True, 0.006, 12, 0.5, 1,
+    plain = plain_plan(Plan(start, goal, (planned,), 0.06, 0.003, float('nan'), True, 0.006, 12, 0.5, 1,
                            'the goal is reached', ('a remark',)))
-    assert set(told) == PLAN_KEYS
-    assert told['error_after_percent_of_length'] == pytest.approx(0.5)
-    assert told['score_after'] is None
-    assert told['actions'][0]['name'] == 'drag'
-    assert told['actions'][0]['hands'][0]['waypoints'][-1] == pytest.approx([0.6, 0.3, 0.06, 0.004])
-    np.testing.assert_array_equal(told['actions'][0]['predicted'], goal.points)
-    assert json.loads(json.dumps(told, allow_nan=False)) == told
+    assert set(plain) == PLAN_KEYS
+    assert plain['error_after_percent_of_length'] == pytest.approx(0.5)
+    assert plain['score_after'] is None
+    assert plain['actions'][0]['name'] == 'drag'
+    assert plain['actions'][0]['hands'][0]['waypoints'][-1] == pytest.approx([0.6, 0.3, 0.06, 0.004])
+    np.testing.assert_array_equal(plain['actions'][0]['predicted'], goal.points)
+    assert json.loads(json.dumps(plain, allow_nan=False)) == plain

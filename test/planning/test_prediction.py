@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""simulate() predicts the chain after each action, and how sure it is."""
+"""simulate() predicts the chain after each action, with its intervals."""
 
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 
@@ -19,7 +19,7 @@ from dlo_calibration.planning import ActionStep, Posterior, RehearsalJob, Rehear
 from dlo_calibration.planning.prediction import intervals, simulate
 
 
-def test_each_named_action_begins_where_the_one_before_left_the_dlo():
+def test_each_named_action_begins_at_the_end_of_the_previous_action():
     prediction = simulate(MadeUpDlo(), straight(), [
         GraspAndPlace(point=0, to=(0.1, 0.2, 0.004)), Drag(point=10, to=(0.3, -0.1, 0.004))], draws=0)
     first, second = prediction.steps
@@ -41,7 +41,7 @@ def test_a_hand_holds_on_until_it_is_released():
     assert [step.step.held_by for step in prediction.steps] == [('left_hand',), ('left_hand',), ()]
 
 
-def test_paths_and_steps_are_taken_as_they_are():
+def test_paths_and_steps_are_simulated_unchanged():
     lift = LiftAndHold(point=20, height=0.1).action(straight())
     opened, = simulate(MadeUpDlo(), straight(), [lift], draws=0).steps
     held, = simulate(MadeUpDlo(), straight(), [ActionStep(lift, ('left_hand',))], draws=0).steps
@@ -91,14 +91,14 @@ def test_the_difference_to_a_finer_simulation_widens_the_interval():
 
 
 @pytest.mark.long
-def test_90_percent_of_the_points_of_a_trial_that_was_left_out_are_in_their_intervals():
+def test_90_percent_of_the_points_of_a_left_out_trial_are_in_their_intervals():
     options = Options.of({'mass': 0.03, 'calibrate': ['flexibility', 'friction'], 'workers': 1})
     trials, _ = session_trials(read_session(samples() / 'object1'), options)
     inside = []
     for k in (1, 2):
-        found = calibrate([one for one in trials if one is not trials[k]], options)
+        result = calibrate([trial for trial in trials if trial is not trials[k]], options)
         goal, = trials[k].goals
-        step, = simulate(found, trials[k].initial, [ActionStep(trials[k].actions[0], goal.held_by)]).steps
+        step, = simulate(result, trials[k].initial, [ActionStep(trials[k].actions[0], goal.held_by)]).steps
         inside.append((step.lower <= goal.chain.points) & (goal.chain.points <= step.upper))
         assert (step.upper - step.lower).mean() < 0.007  # of a rope of 60 cm, seen with a noise of 1 mm
     assert np.mean(inside) == pytest.approx(0.9, abs=0.06)
@@ -106,10 +106,10 @@ def test_90_percent_of_the_points_of_a_trial_that_was_left_out_are_in_their_inte
 
 def test_the_same_seed_gives_the_same_prediction():
     action = GraspAndPlace(point=5, direction=(0, 1, 0), distance=0.1)
-    one, same, other = (simulate(MadeUpDlo(), straight(), [action], draws=3, seed=seed).steps[0]
+    first, same, other = (simulate(MadeUpDlo(), straight(), [action], draws=3, seed=seed).steps[0]
                         for seed in (1, 1, 2))
-    assert np.array_equal(one.lower, same.lower) and np.array_equal(one.chain, other.chain)
-    assert not np.array_equal(one.lower, other.lower)
+    assert np.array_equal(first.lower, same.lower) and np.array_equal(first.chain, other.chain)
+    assert not np.array_equal(first.lower, other.lower)
 
 
 def test_rehearsals_do_not_depend_on_the_executor():
@@ -120,10 +120,10 @@ def test_rehearsals_do_not_depend_on_the_executor():
     alone = Rehearser(Pool(simulator))
     with ThreadPoolExecutor(2) as executor:
         together = Rehearser(Pool(simulator, executor))
-        for one, other in zip(alone(jobs), together(jobs), strict=True):
-            assert np.array_equal(one.chains, other.chains)
-            assert all(map(np.array_equal, one.trajectories, other.trajectories))
-            assert len(one.trajectories) == 2 and len(one.trajectories[0]) > 10
+        for rehearsal, other in zip(alone(jobs), together(jobs), strict=True):
+            assert np.array_equal(rehearsal.chains, other.chains)
+            assert all(map(np.array_equal, rehearsal.trajectories, other.trajectories))
+            assert len(rehearsal.trajectories) == 2 and len(rehearsal.trajectories[0]) > 10
     assert alone.count == together.count == 8
 
 
@@ -131,15 +131,15 @@ def test_rehearsals_do_not_depend_on_the_executor():
 def test_a_trajectory_has_no_gaps_however_fast_the_hand_is(speed):
     lift = GraspAndPlace(point=0, direction=(0, 1, 0), distance=0.1, speed=speed)
     step = ActionStep(lift.action(straight()))
-    found, = Rehearser(Pool(make_simulator(Options())))(
+    rehearsal, = Rehearser(Pool(make_simulator(Options())))(
         [RehearsalJob(straight(), (step,), Posterior.of(MadeUpDlo()).best, trajectories=True)])
-    course, = found.trajectories
+    course, = rehearsal.trajectories
     assert np.linalg.norm(np.diff(course[:, 0], axis=0), axis=1).max() < 0.0101
     assert course[:, 0, 2].max() > 0.05
     np.testing.assert_allclose(course[-1, 0], step.action.hands[0].positions[-1], atol=0.0101)
 
 
-def test_a_hand_that_holds_does_so_on_the_way_of_another_one():
+def test_a_hand_holds_on_while_another_moves():
     lift = LiftAndHold(point=20, height=0.1, hand='a').action(straight())
     drag = Drag(point=0, to=(0.0, 0.1, 0.004), hand='b').action(straight())
     steps, physical = (ActionStep(lift, ('a',)), ActionStep(drag, ('a',))), Posterior.of(MadeUpDlo()).best
@@ -154,18 +154,18 @@ def test_draws_of_the_same_actions_are_rehearsed_as_each_alone():
     rehearse, start, steps = Rehearser(Pool(make_simulator(Options()))), straight(), (step,)
     draws = Posterior.of(MadeUpDlo()).draws(3, 1)
     together = rehearse([RehearsalJob(start, steps, physical) for physical in draws])
-    for one, physical in zip(together, draws, strict=True):
+    for rehearsal, physical in zip(together, draws, strict=True):
         alone, = rehearse([RehearsalJob(straight(), (step,), physical)])
-        assert np.array_equal(one.chains, alone.chains)
+        assert np.array_equal(rehearsal.chains, alone.chains)
     assert not np.array_equal(together[0].chains, together[1].chains)
 
 
 def test_a_rehearsal_that_diverges_says_so():
     step = ActionStep(Drag(point=5, direction=(0, 1, 0), distance=0.1).action(straight()))
     physical = Posterior.of(MadeUpDlo()).best
-    found, = Rehearser(Pool(ToySimulator(fail_below=101)))([RehearsalJob(straight(), (step,), physical)])
-    assert 'diverged' in found.failure
-    assert np.isnan(found.chains).all()
+    rehearsal, = Rehearser(Pool(ToySimulator(fail_below=101)))([RehearsalJob(straight(), (step,), physical)])
+    assert 'diverged' in rehearsal.failure
+    assert np.isnan(rehearsal.chains).all()
 
 
 def test_a_prediction_can_be_stopped():

@@ -65,9 +65,9 @@ def test_picture_of_a_session_has_a_row_per_trial(tmp_path):
     trials = toy_trials(2)
     session_picture(trials[:1], [chains_of(trials[0])], tmp_path / 'one.png')
     session_picture(trials, [chains_of(trial) for trial in trials], tmp_path / 'both.png')
-    one, both = Image.open(tmp_path / 'one.png'), Image.open(tmp_path / 'both.png')
-    assert one.width == both.width
-    assert 1.7 * one.height < both.height < 2.05 * one.height
+    alone, both = Image.open(tmp_path / 'one.png'), Image.open(tmp_path / 'both.png')
+    assert alone.width == both.width
+    assert 1.7 * alone.height < both.height < 2.05 * alone.height
 
 
 @pytest.mark.long
@@ -233,7 +233,7 @@ def test_animation_moves_and_rests_at_its_end(tmp_path, monkeypatch):
         frames.append(np.asarray(gif.convert('RGB')).astype(int))
         durations.append(gif.info['duration'])
     assert len(frames) > 6
-    assert all((one != two).any() for one, two in zip(frames[:-1], frames[1:], strict=True))
+    assert all((frame != following).any() for frame, following in zip(frames[:-1], frames[1:], strict=True))
     assert durations[-1] > 4 * durations[0]
     assert sum(durations) / 1e3 > trial.hands[0].end
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A result with a rest shape of nine knots, thirty parameters in all, is told in every form, and readable."""
+"""A result with a rest shape of nine knots, thirty parameters in all, is readable in every form."""
 
 import base64
 from dataclasses import replace
@@ -44,25 +44,25 @@ from dlo_calibration.writing import write_file
 @pytest.fixture(scope='module')
 def result():
     """Return a result with thirty parameters."""
-    found = rest_shape_result()
-    assert len(found.parameters) == 30
-    return found
+    result = rest_shape_result()
+    assert len(result.parameters) == 30
+    return result
 
 
 @pytest.fixture(scope='module')
 def straight():
-    """Return a result of a DLO that remembers nothing."""
+    """Return a result of a DLO without rest shape and friction between strands."""
     return calibrate(toy_trials(1), Options.of({'workers': 1, 'evaluations': 10}), make_simulator=new_toy)
 
 
 def test_the_result_file_has_every_parameter(result, tmp_path):
     document = description_document(result)
-    found = read_description(document)
-    assert found.physical() == result.physical()
-    assert found.space.knots == 9
-    assert found.correlations == result.correlations
-    assert found.parameters['rest_curvature_y4'] == result.parameters['rest_curvature_y4']
-    assert description_document(found) == document
+    description = read_description(document)
+    assert description.physical() == result.physical()
+    assert description.space.knots == 9
+    assert description.correlations == result.correlations
+    assert description.parameters['rest_curvature_y4'] == result.parameters['rest_curvature_y4']
+    assert description_document(description) == document
     write_evaluations(tmp_path / 'evaluations.csv', result)
     assert 'rest_curvature_y9' in (tmp_path / 'evaluations.csv').read_text().splitlines()[0]
 
@@ -73,17 +73,17 @@ def test_a_result_file_without_rest_shape_and_friction_is_read(straight):
     for element in parameters.findall('fixed'):
         if element.get('name').startswith('bending_'):
             parameters.remove(element)
-    found = read_description(etree.tostring(root))
-    assert found.physical() == straight.physical()
-    assert not found.physical()['bending_friction']
+    description = read_description(etree.tostring(root))
+    assert description.physical() == straight.physical()
+    assert not description.physical()['bending_friction']
 
 
 def test_json_and_message_have_every_component(result):
-    told = json.loads(json.dumps(plain(result), allow_nan=False))
+    document = json.loads(json.dumps(plain(result), allow_nan=False))
     message = diagnostics.result(bag_types(), result, stamp=1)
     values = result_values(message)
     for name in knot_names(9):
-        assert told['parameters'][name]['value'] == result.values[name] == values[name]['value']
+        assert document['parameters'][name]['value'] == result.values[name] == values[name]['value']
     assert len(message.status) == 31
 
 
@@ -97,43 +97,44 @@ def test_the_table_has_a_line_for_each_knot(result):
 
 
 def test_sentences_say_where_it_is_curved_and_what_it_keeps(result):
-    told = sentences(result)
-    shape, = (text for text in told if text.startswith('When nothing bends it'))
+    texts = sentences(result)
+    shape, = (text for text in texts if text.startswith('When nothing bends it'))
     assert 'most at 38 % of its length, by 6.38 1/m (a radius of 157 mm)' in shape
     assert 'Of the 18 components of this rest shape, rest_curvature_x1 to rest_curvature_y9, ' \
-           '17 are known well, 1 only roughly.' in told
-    kept, = (text for text in told if text.startswith('Bent far and released'))
-    assert '2.01 1/m (a radius of 497 mm)' in kept and 'more than 0.299 1/m' in kept
-    assert not any(text.startswith('rest_curvature') for text in told)
-    assert len(told) < 25
+           '17 are known well, 1 only roughly.' in texts
+    bend, = (text for text in texts if text.startswith('Bent far and released'))
+    assert '2.01 1/m (a radius of 497 mm)' in bend and 'more than 0.299 1/m' in bend
+    assert not any(text.startswith('rest_curvature') for text in texts)
+    assert len(texts) < 25
     missing = replace(result, missing_parameters=(MissingParameter('marker_mass', 0.3),))
-    assert 'name marker_mass in calibrate, beside flexibility' in sentences(missing)[-1]
-    assert 'rest_curvature' not in sentences(missing)[-1]
+    words, = (text for text in sentences(missing) if 'name marker_mass in calibrate, beside' in text)
+    assert 'rest_curvature' not in words
 
 
 def test_friction_between_strands_gives_a_sentence_only_where_it_is_known(result, without_drawings):
-    def kept(**verdicts):
+    def bend(**verdicts):
         changed = {name: replace(result.parameters[name], verdict=verdict)
                    for name, verdict in verdicts.items()}
-        found = replace(result, parameters={**result.parameters, **changed})
-        return ''.join(text for text in sentences(found) if text.startswith('Bent far')), moment_panels(found)
+        uncertain = replace(result, estimates={**result.parameters, **changed})
+        words = ''.join(text for text in sentences(uncertain) if text.startswith('Bent far'))
+        return words, moment_panels(uncertain)
 
-    assert kept(bending_friction=NOT_IDENTIFIABLE) == ('', [])
-    assert ' may keep a curvature ' in kept(bending_friction=WEAK)[0]
-    words, drawn = kept(bending_friction=IDENTIFIABLE, bending_slip=NOT_IDENTIFIABLE)
+    assert bend(bending_friction=NOT_IDENTIFIABLE) == ('', [])
+    assert ' may keep a curvature ' in bend(bending_friction=WEAK)[0]
+    words, drawn = bend(bending_friction=IDENTIFIABLE, bending_slip=NOT_IDENTIFIABLE)
     assert ' keeps a curvature ' in words and 'slip' not in words and drawn
 
 
 def test_draws_are_whole_ropes_within_the_scale(result):
     posterior = Posterior.of(read_description(description_document(result)))
     draws = posterior.draws(200, seed=3)
-    assert all(set(one) == set(result.physical()) for one in draws)
+    assert all(set(draw) == set(result.physical()) for draw in draws)
     for name in knot_names(9):
-        values = [one[name] for one in draws]
+        values = [draw[name] for draw in draws]
         inside = result.parameters[name]
         share = np.mean([inside.physical_lower <= value <= inside.physical_upper for value in values])
         assert 0.8 < share <= 1 and max(map(abs, values)) <= 25
-    drawn = np.array([[one[name] for name in ('rest_curvature_x2', 'rest_curvature_y2')] for one in draws])
+    drawn = np.array([[draw[name] for name in ('rest_curvature_x2', 'rest_curvature_y2')] for draw in draws])
     expected = result.correlations['rest_curvature_x2']['rest_curvature_y2']
     assert np.corrcoef(drawn.T)[0, 1] == pytest.approx(expected, abs=0.2)
 
@@ -151,8 +152,8 @@ def test_the_page_stays_small(result, tmp_path, without_drawings):
 
 
 def test_drawings_are_images(result):
-    for one in (*rest_shape_panels(result), *moment_panels(result)):
-        svg = base64.b64decode(one.source.partition(',')[2])
+    for drawing in (*rest_shape_panels(result), *moment_panels(result)):
+        svg = base64.b64decode(drawing.source.partition(',')[2])
         assert etree.fromstring(svg) is not None and len(svg) < 2e5
 
 
@@ -172,10 +173,10 @@ def test_a_shape_is_drawn_from_its_side_without_a_mirror():
     helix = np.stack([np.cos(angles), np.sin(angles), 0.2 * angles], axis=1)
     turn = np.linalg.qr(np.random.default_rng(2).normal(size=(3, 3)))[0]
     turn *= np.sign(np.linalg.det(turn))
-    for one in (helix, helix[:, ::-1], helix @ turn):
-        axes = _best_axes(one)
+    for curve in (helix, helix[:, ::-1], helix @ turn):
+        axes = _best_axes(curve)
         np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-9)
         assert np.linalg.det(axes) > 0
-        seen = (one - one.mean(axis=0)) @ axes
-        np.testing.assert_allclose(_moved_onto(one @ turn.T + 3, seen), seen, atol=1e-9)
+        seen = (curve - curve.mean(axis=0)) @ axes
+        np.testing.assert_allclose(_moved_onto(curve @ turn.T + 3, seen), seen, atol=1e-9)
         assert (np.diff(seen.std(axis=0)) <= 0).all()

@@ -125,8 +125,9 @@ def test_drawings_are_images_that_stand_alone_and_do_not_change(result, drawn, t
         root = etree.fromstring(base64.b64decode(octets))
         assert (kind, etree.QName(root).localname) == ('data:image/svg+xml', 'svg')
         links = root.xpath('//@*[local-name() = "href"]')
-        inside = [one[1:] for one in links if not one.startswith('data:image/png')]  # as bars of colours are
-        assert inside and all(root.xpath('//*[@id=$id]', id=one) for one in inside)
+        # Bars of colours are PNG images.
+        inside = [link[1:] for link in links if not link.startswith('data:image/png')]
+        assert inside and all(root.xpath('//*[@id=$id]', id=link) for link in inside)
     assert Outline(written(tmp_path, result)).drawings.items() <= drawings.items()
 
 
@@ -160,24 +161,25 @@ def test_the_page_advises_an_action(result, page):
     assert 'from 20 to 5.' in text
 
 
-def test_warnings_and_problems_are_shown(result, page):
+def test_warnings_of_result_and_session_are_shown(result, page):
     text = words(page(replace(result, warnings=('it never rested',)),
-                      Origin('s', 'c', OPTIONS, problems=('a message was lost',))))
+                      Origin('s', 'c', OPTIONS, warnings=('a message was lost',))))
     assert 'Warnings' in text
     assert 'it never rested' in text
     assert 'a message was lost' in text
 
 
-def test_numbers_that_are_not_known_are_left_out(result, page):
+def test_unknown_numbers_are_not_shown(result, page):
     unknown = replace(result.examination, cross_validated=math.nan, noise=math.nan, default_error=math.nan)
     for examination in (None, unknown):
         assert not re.search(r'\b(nan|inf)\b', page(replace(result, examination=examination)))
 
 
 def test_search_shows_what_failed(result):
-    """Legends tell what there is, and no more."""
+    """Legends name only what is drawn."""
     def searched(**changes):
-        evaluations = [replace(one, scores=(9.0,) * 3, skipped=0, failure='') for one in result.evaluations]
+        evaluations = [replace(evaluation, scores=(9.0,) * 3, skipped=0, failure='')
+                       for evaluation in result.evaluations]
         evaluations[1] = replace(evaluations[1], **changes)
         shown = convergence_panel(replace(result, evaluations=tuple(evaluations)))
         return shown.words, base64.b64decode(shown.source.partition(',')[2]).decode()
@@ -186,7 +188,7 @@ def test_search_shows_what_failed(result):
     assert all('could not be simulated' in text for text in searched(scores=(), failure='diverged'))
 
 
-def test_slices_are_drawn_or_said_to_be_left_out(result, page, drawn):
+def test_slices_are_drawn_or_reported_as_missing(result, page, drawn):
     without = page(result)
     assert 'Left out' in without
     assert 'Along flexibility' in drawn
@@ -274,9 +276,9 @@ def test_browser_shows_it_without_scrolling_sideways(drawn, browse, tmp_path):
         assert max(verdicts) <= width  # no verdict must be scrolled to
     frame.write_text(framed(drawn, heights), encoding='utf-8')
     browse(f'--screenshot={shot}', f'--window-size={sum(WIDTHS)},{max(heights.values())}', frame.as_uri())
-    whole, left = np.asarray(Image.open(shot).convert('L')), 0
+    whole, begin = np.asarray(Image.open(shot).convert('L')), 0
     for width, down in heights.items():
-        seen, left = whole[:down, left:left + width], left + width
+        seen, begin = whole[:down, begin:begin + width], begin + width
         assert (seen[:, :4] > 250).all() and (seen[:, -2:] > 250).all()  # nothing is cut off at the sides
         for part in np.array_split(seen, down // 1000):
             assert (part < 128).mean() > 0.002  # there is something to read everywhere

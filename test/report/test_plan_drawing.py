@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A plan is drawn action by action, moves in an animation, and is told in sentences."""
+"""A plan has a picture of each action, an animation and sentences."""
 
 from dataclasses import replace
 

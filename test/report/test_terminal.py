@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The progress bar tells a time left only from what was simulated now."""
+"""The progress bar derives the time left only from simulations of this process."""
 
 import io
 
@@ -16,10 +16,10 @@ class Terminal(io.StringIO):
         return True
 
 
-def last_line(known):
-    """Return what is left of a bar after eight of ten evaluations."""
+def last_line(logged):
+    """Return the last line of a bar after eight of ten evaluations."""
     stream = Terminal()
-    with SearchBar(10, stream, known=known) as bar:
+    with SearchBar(10, stream, logged=logged) as bar:
         for count in range(1, 9):
             bar.move(count, 5.0)
     return next(line for line in reversed(stream.getvalue().splitlines()) if '8/10' in line)
@@ -31,7 +31,7 @@ def test_evaluations_from_a_log_do_not_count_for_the_time_left(monkeypatch):
     assert '-:--:--' in last_line(8)
 
 
-def test_a_plan_shows_how_near_it_is_and_the_time_left(monkeypatch):
+def test_a_plan_shows_its_best_error_and_the_time_left(monkeypatch):
     monkeypatch.setenv('TERM', 'xterm')
     stream, quiet = Terminal(), Terminal()
     for target, shown in ((stream, True), (quiet, False)):

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from dlo_calibration.errors import InputError
-from dlo_calibration.vision.camera import read_lens
+from dlo_calibration.vision.lens import read_lens
 from dlo_calibration.vision.photograph import decoded, ENCODINGS
 
 pytest.importorskip('rclpy', reason='needs ROS 2, sourced or from PyPI')
@@ -108,7 +108,7 @@ def image(encoding, values, step=None, big=False):
 
 def mosaic(pattern):
     """Return a (4, 4) mosaic of one colour; `pattern` has the letters of its first two rows."""
-    tile = [COLOUR['rgb'.index(one)] for one in pattern]
+    tile = [COLOUR['rgb'.index(letter)] for letter in pattern]
     return np.tile(np.array(tile, np.uint8).reshape(2, 2), (2, 2))
 
 
@@ -117,7 +117,7 @@ IMAGES = {
     'bgr8': np.full((4, 4, 3), COLOUR[::-1], np.uint8),
     'rgba8': np.full((4, 4, 4), (*COLOUR, 7), np.uint8),
     'bgra8': np.full((4, 4, 4), (*COLOUR[::-1], 7), np.uint8),
-    **{f'bayer_{one}8': mosaic(one) for one in ('rggb', 'bggr', 'gbrg', 'grbg')},
+    **{f'bayer_{pattern}8': mosaic(pattern) for pattern in ('rggb', 'bggr', 'gbrg', 'grbg')},
 }
 
 
@@ -129,8 +129,8 @@ def test_colours_are_decoded(encoding):
 def test_grey_images_are_decoded():
     assert (decoded('image', image('mono8', np.full((4, 4), 77, np.uint8))) == 77).all()
     ramp = (np.arange(16).reshape(4, 4) * 100).astype('>u2')
-    found = decoded('image', image('mono16', ramp, big=True))
-    assert found[0, 0, 0] == 0 and found[3, 3, 2] == 255
+    pixels = decoded('image', image('mono16', ramp, big=True))
+    assert pixels[0, 0, 0] == 0 and pixels[3, 3, 2] == 255
 
 
 @pytest.mark.parametrize('encoding, order', [('yuv422', (0, 1, 2, 3)), ('yuv422_yuy2', (1, 0, 3, 2))])
@@ -138,8 +138,8 @@ def test_video_images_are_decoded(encoding, order):
     mild = (150, 100, 120)
     luma, red, blue = cv2.cvtColor(np.full((1, 1, 3), mild, np.uint8), cv2.COLOR_RGB2YCrCb)[0, 0]
     pair = np.array([blue, luma, red, luma], np.uint8)[list(order)]  # U Y V Y, or Y U Y V
-    found = decoded('image', image(encoding, np.tile(pair, (4, 2)))).astype(int)
-    assert np.abs(found - mild).max() < 15
+    pixels = decoded('image', image(encoding, np.tile(pair, (4, 2)))).astype(int)
+    assert np.abs(pixels - mild).max() < 15
 
 
 @pytest.mark.parametrize('fields', [

@@ -23,7 +23,7 @@ from dlo_calibration.ros import diagnostics
 STAMP = 12_500_000_000
 
 
-def found_result(**changes):
+def sample_result(**changes):
     estimates = {
         'flexibility': ParameterEstimate('flexibility', 100 / 3, 0.1 + 0.2, 30.0, 36.5, 1e-3 / 7, 1e-5, 2e-3,
                                          'N m^2 per N/m', True),
@@ -39,28 +39,28 @@ def found_result(**changes):
 
 
 def by_name(message):
-    return {one.name: (one, {pair.key: pair.value for pair in one.values}) for one in message.status}
+    return {part.name: (part, {pair.key: pair.value for pair in part.values}) for part in message.status}
 
 
 def test_result_has_every_parameter_exactly(types):
-    found = found_result()
-    message = diagnostics.result(types, found, STAMP)
+    result = sample_result()
+    message = diagnostics.result(types, result, STAMP)
     values = result_values(message)
     assert list(values) == ['flexibility', 'friction']
-    for name, estimate in found.parameters.items():
+    for name, estimate in result.parameters.items():
         assert list(values[name]) == [
             'value', 'std', 'lower', 'upper', 'unit', 'physical_value', 'physical_lower', 'physical_upper',
             'physical_unit', 'identifiable', 'verdict', 'note']
         for key, value in values[name].items():
             assert value == ('0..100' if key == 'unit' else getattr(estimate, key))
-    levels = {name: one.level for name, (one, _) in by_name(message).items()}
+    levels = {name: status.level for name, (status, _) in by_name(message).items()}
     assert levels['flexibility'] == types.level(0)
     assert levels['friction'] == types.level(1)
     assert (message.header.stamp.sec, message.header.stamp.nanosec) == (12, 500_000_000)
 
 
 def test_result_has_the_values_of_the_whole_calibration(types):
-    one, values = by_name(diagnostics.result(types, found_result(), STAMP))['calibration']
+    status, values = by_name(diagnostics.result(types, sample_result(), STAMP))['calibration']
     assert values.pop('seconds') == '9.1'
     assert [float(score) for score in values.pop('scores').split()] == [40.5, 20.25]
     assert float(values.pop('error_percent_of_length')) == pytest.approx(0.1)
@@ -70,19 +70,19 @@ def test_result_has_the_values_of_the_whole_calibration(types):
     assert values == {
         'score': '30.375', 'trials': '2', 'evaluations': '3', 'simulations': '6', 'engine': 'bullet',
         'search': 'random', 'seed': '7', 'stop_reason': 'budget of 3 evaluations spent', 'choice': '',
-        'unusable': '', 'warnings': 'one; two', 'undetermined': '',
+        'headline': sample_result().headline, 'unusable': '', 'warnings': 'one; two', 'undetermined': '',
         'cross_validated_error_mm': '', 'default_error_mm': '',
         'noise_mm': '', 'residual_std_mm': ''}
-    assert one.level == types.level(1)
-    clean = found_result(warnings=(), seed=None)
-    one, values = by_name(diagnostics.result(types, clean, STAMP))['calibration']
-    assert one.level == types.level(0)
-    assert one.message.startswith('This result is usable. Score 30.4')
+    assert status.level == types.level(1)
+    clean = sample_result(warnings=(), seed=None)
+    status, values = by_name(diagnostics.result(types, clean, STAMP))['calibration']
+    assert status.level == types.level(0)
+    assert status.message.startswith('Usable: the simulated points are 2 mm from the measured ones')
     assert (values['seed'], values['warnings']) == ('', '')
-    poor = found_result(warnings=(), implausible=('trial 1: a DLO in the air',))
-    one, values = by_name(diagnostics.result(types, poor, STAMP))['calibration']
-    assert one.level == types.level(1)
-    assert one.message.startswith('Do not use this result: trial 1: a DLO in the air. Score')
+    poor = sample_result(warnings=(), implausible=('trial 1: a DLO in the air',))
+    status, values = by_name(diagnostics.result(types, poor, STAMP))['calibration']
+    assert status.level == types.level(1)
+    assert status.message.startswith('Not usable: trial 1: a DLO in the air. The simulated')
     assert values['unusable'] == 'trial 1: a DLO in the air'
 
 
@@ -91,33 +91,33 @@ def test_progress_has_the_best_so_far_and_the_time_left(types):
     failed = Evaluation(4, np.array([0.5]), {'friction': 50.0}, failure='diverged')
     progress = SimpleNamespace(newest=failed, best=best, evaluations=150, simulations_per_second=31.5,
                                seconds_left=4.6, spread={})
-    one, values = by_name(diagnostics.progress(types, progress, STAMP))['progress']
+    status, values = by_name(diagnostics.progress(types, progress, STAMP))['progress']
     assert values == {'evaluation': '5', 'evaluations': '150', 'score': 'inf', 'best_score': '12.0',
                       'best_friction': '25.0', 'simulations_per_second': '31.5', 'seconds_left': '4.6',
                       'failure': 'diverged'}
-    assert one.message == 'evaluation 5 of 150, best score 12, 4.6 s left'
-    assert one.level == types.level(1)
+    assert status.message == 'evaluation 5 of 150, best score 12, 4.6 s left'
+    assert status.level == types.level(1)
 
 
 @pytest.mark.parametrize(('state', 'level'), [
     ('collecting', 0), ('calibrating', 0), ('done', 0), ('failed', 2)])
 def test_status_has_state_trials_and_refusal(types, state, level):
     content = {'state': state, 'trials': 3, 'last_refusal': 'too few', 'detail': 'why'}
-    one, values = by_name(diagnostics.status(types, STAMP, content, None))['status']
+    status, values = by_name(diagnostics.status(types, STAMP, content, None))['status']
     assert values == {**content, 'trials': '3', 'last_trial': ''}
-    assert one.message == f'{state}: why'
-    assert one.level == types.level(level)
+    assert status.message == f'{state}: why'
+    assert status.level == types.level(level)
 
 
 def test_status_says_what_the_newest_trial_adds(types):
-    told = TrialInformation('trial 2', ('flexibility', 'friction'), [0.0625, 0.25], [0.015625, 0.25])
-    one, values = by_name(diagnostics.status(
-        types, STAMP, {'state': 'collecting', 'detail': ''}, told))['status']
-    assert values['last_trial'] == told.words
+    information = TrialInformation('trial 2', ('flexibility', 'friction'), [0.0625, 0.25], [0.015625, 0.25])
+    status, values = by_name(diagnostics.status(
+        types, STAMP, {'state': 'collecting', 'detail': ''}, information))['status']
+    assert values['last_trial'] == information.words
     assert {key: float(value) for key, value in values.items() if key.startswith('std_')} == {
         'std_before_flexibility': 6.25, 'std_before_friction': 25.0,
         'std_after_flexibility': 1.5625, 'std_after_friction': 25.0}
-    assert one.message == f'collecting; {told.words}'
+    assert status.message == f'collecting; {information.words}'
     failed, values = by_name(diagnostics.status(
         types, STAMP, {'state': 'failed', 'detail': 'why'},
         TrialInformation.unknown('trial 2', ('friction',), 'it diverged')))['status']
@@ -128,7 +128,7 @@ def test_status_says_what_the_newest_trial_adds(types):
 
 def test_diagnostics_cross_the_wire(types):
     travel = wire(types)
-    values = result_values(travel(diagnostics.result(types, found_result(), STAMP)))
+    values = result_values(travel(diagnostics.result(types, sample_result(), STAMP)))
     assert values['flexibility']['value'] == 100 / 3
     report = travel(diagnostics.status(types, STAMP, {'state': 'failed', 'detail': 'why'}, None))
     assert report.status[0].level == types.level(2)

@@ -74,33 +74,39 @@ def launched(node, monkeypatch, **given):
         f'{node}_launch', ROOT / 'launch' / f'{node}.launch.py')
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    found = module.generate_launch_description().words[0]
-    context = {**{one.words[0]: one.options['default_value'] for one in found
-                  if one.kind == 'DeclareLaunchArgument'}, **given}
-    return [entity for one in found for entity in (
-        one.options['function'](context) if one.kind == 'OpaqueFunction' else [one])]
+    description = module.generate_launch_description().words[0]
+    context = {**{entity.words[0]: entity.options['default_value'] for entity in description
+                  if entity.kind == 'DeclareLaunchArgument'}, **given}
+    return [action for entity in description for action in (
+        entity.options['function'](context) if entity.kind == 'OpaqueFunction' else [entity])]
+
+
+def declared(entities):
+    """Return the options of the launch arguments, by name."""
+    return {entity.words[0]: entity.options for entity in entities if entity.kind == 'DeclareLaunchArgument'}
 
 
 def test_launch_starts_the_node_with_its_parameter_file(node, described):
-    arguments = {one.words[0]: one.options for one in described if one.kind == 'DeclareLaunchArgument'}
-    one, = (one for one in described if one.kind == 'Node' and one.options['package'] == 'dlo_calibration')
-    assert f"f'{one.options['executable']} = " in (ROOT / 'setup.py').read_text(encoding='utf-8')
-    assert one.options['name'] == one.options['executable'] == node
-    assert 'condition' not in one.options
-    flag, file = one.options['ros_arguments']
+    arguments = declared(described)
+    started, = (entity for entity in described
+                if entity.kind == 'Node' and entity.options['package'] == 'dlo_calibration')
+    assert f"f'{started.options['executable']} = " in (ROOT / 'setup.py').read_text(encoding='utf-8')
+    assert started.options['name'] == started.options['executable'] == node
+    assert 'condition' not in started.options
+    flag, file = started.options['ros_arguments']
     assert flag == '--params-file'
     assert Path(arguments[file.words[0]]['default_value']) == ROOT / 'config' / f'{node}.yaml'
 
 
 def test_launch_passes_a_description_on(monkeypatch):
-    one, = (one for one in launched('planner', monkeypatch, description='some/result.xml')
-            if one.kind == 'Node' and one.options['package'] == 'dlo_calibration')
-    assert one.options['ros_arguments'][2:] == ['-p', 'description:=some/result.xml']
+    started, = (entity for entity in launched('planner', monkeypatch, description='some/result.xml')
+                if entity.kind == 'Node' and entity.options['package'] == 'dlo_calibration')
+    assert started.options['ros_arguments'][2:] == ['-p', 'description:=some/result.xml']
 
 
 def test_launch_starts_rviz_only_where_it_is_asked_for(node, described):
-    arguments = {one.words[0]: one.options for one in described if one.kind == 'DeclareLaunchArgument'}
-    rviz, = (one for one in described if one.kind == 'Node' and one.options['package'] == 'rviz2')
+    arguments = declared(described)
+    rviz, = (entity for entity in described if entity.kind == 'Node' and entity.options['package'] == 'rviz2')
     asked, = rviz.options['condition'].words
     assert arguments[asked.words[0]]['default_value'] == 'false'
     assert Path(rviz.options['arguments'][1]) == ROOT / 'config' / f'{node}.rviz'
@@ -108,31 +114,31 @@ def test_launch_starts_rviz_only_where_it_is_asked_for(node, described):
 
 
 def test_launch_arguments_are_described(node, described):
-    arguments = {one.words[0]: one.options for one in described if one.kind == 'DeclareLaunchArgument'}
+    arguments = declared(described)
     assert set(arguments) == {'params_file', 'namespace', 'goal_chain', 'rviz', 'frame', *(
         ['description', 'chain'] if node == 'planner' else ['mass', 'table_height'])}
-    assert all(one['description'] for one in arguments.values())
+    assert all(options['description'] for options in arguments.values())
 
 
-def test_launch_passes_on_what_is_given_and_rviz_shows_it(node, monkeypatch):
+def test_launch_passes_arguments_on_and_rviz_shows_the_topics(node, monkeypatch):
     monkeypatch.setattr(launching, 'check_rviz', lambda wanted: None)
     given = {'namespace': 'left', 'goal_chain': '/trackdlo/results_pc', 'rviz': 'true'}
     if node == 'calibrator':
         given |= {'mass': '0.03', 'table_height': '0.7'}
-    started = {one.options['package']: one.options for one in launched(node, monkeypatch, **given)
-               if one.kind == 'Node'}
+    started = {entity.options['package']: entity.options for entity in launched(node, monkeypatch, **given)
+               if entity.kind == 'Node'}
     words = started['dlo_calibration']['ros_arguments'][2:]
     assert words[-2:] == ['-r', '~/goal_chain:=/trackdlo/results_pc']
     assert words[:-2] == (['-p', 'mass:=0.03', '-p', 'table_height:=0.7'] if node == 'calibrator' else [])
     assert started['dlo_calibration']['namespace'] == 'left'
-    topics = {one['Topic']['Value'] for one in rviz_displays(node) if 'Topic' in one}
+    topics = {display['Topic']['Value'] for display in rviz_displays(node) if 'Topic' in display}
     remapped = dict(started['rviz2']['remappings'])
     assert set(remapped) == topics
     assert remapped[f'/{node}/goal_chain'] == '/trackdlo/results_pc'
     assert remapped[f'/{node}/markers'] == f'/left/{node}/markers'
 
 
-def test_launch_without_the_rviz_that_is_wanted_starts_nothing_and_says_so(node, monkeypatch):
+def test_launch_is_refused_if_rviz_is_wanted_and_not_installed(node, monkeypatch):
     with pytest.raises(InputError, match='rviz:=true: no package rviz2; .*apt install'):
         launched(node, monkeypatch, rviz='true')
 
@@ -168,15 +174,16 @@ def rviz_displays(node):
 
 
 def test_rviz_shows_topics_of_the_contract_with_displays_of_their_types(node):
-    shown = {one['Topic']['Value']: one['Class'] for one in rviz_displays(node) if 'Topic' in one}
+    shown = {display['Topic']['Value']: display['Class']
+             for display in rviz_displays(node) if 'Topic' in display}
     assert f'/{node}/markers' in shown
     for topic, display in shown.items():
         assert display.split('/')[1] == TOPICS[topic].split('/')[2]
 
 
 def test_rviz_gets_markers_that_were_sent_before_it_started(node):
-    markers, = (one for one in rviz_displays(node)
-                if one.get('Topic', {}).get('Value') == f'/{node}/markers')
+    markers, = (display for display in rviz_displays(node)
+                if display.get('Topic', {}).get('Value') == f'/{node}/markers')
     assert markers['Topic']['Durability Policy'] == 'Transient Local'
     assert markers['Enabled'] is True
 
@@ -184,9 +191,9 @@ def test_rviz_gets_markers_that_were_sent_before_it_started(node):
 def texts(value):
     """List all texts in a JSON document, keys too."""
     if isinstance(value, dict):
-        return [text for pair in value.items() for one in pair for text in texts(one)]
+        return [text for pair in value.items() for part in pair for text in texts(part)]
     if isinstance(value, list):
-        return [text for one in value for text in texts(one)]
+        return [text for item in value for text in texts(item)]
     return [value] if isinstance(value, str) else []
 
 
@@ -228,7 +235,7 @@ def test_foxglove_plots_values_that_the_planner_sends():
 
 
 def sent(topic, message):
-    return {(topic, one.name, pair.key) for one in message.status for pair in one.values}
+    return {(topic, status.name, pair.key) for status in message.status for pair in status.values}
 
 
 def foxglove_plots(node):

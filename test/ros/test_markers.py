@@ -35,10 +35,10 @@ def shown(types, trials, result=None):
     array = wire(types)(markers(types, trials, stamp=STAMP, frame_id='table', result=result))
     first, *rest = array.markers
     assert (first.action, first.header.frame_id) == (DELETE_ALL, 'table')
-    found = {}
+    marks = {}
     for marker in rest:
-        found.setdefault(marker.ns, []).append(marker)
-    return found
+        marks.setdefault(marker.ns, []).append(marker)
+    return marks
 
 
 def points(marker):
@@ -63,15 +63,15 @@ def test_markers_stay_in_the_frame_of_the_chains(types):
 
 def test_collected_trials_show_initial_and_goal_chains_and_hands(types):
     trials = toy_trials(2)
-    found = shown(types, trials)
-    assert set(found) == {f'trial_{k}/{name}' for k in (1, 2)
+    marks = shown(types, trials)
+    assert set(marks) == {f'trial_{k}/{name}' for k in (1, 2)
                           for name in ('initial', 'goal', 'hands', 'label')}
     for k, trial in enumerate(trials, start=1):
-        initial, = found[f'trial_{k}/initial']
+        initial, = marks[f'trial_{k}/initial']
         assert np.array_equal(points(initial), trial.initial.points)
-        for goal in found[f'trial_{k}/goal']:
+        for goal in marks[f'trial_{k}/goal']:
             assert np.array_equal(points(goal), trial.goals[0].chain.points)
-        label, = found[f'trial_{k}/label']
+        label, = marks[f'trial_{k}/label']
         assert (label.type, label.text) == (TEXT, trial.name)
 
 
@@ -89,27 +89,27 @@ def test_every_marker_can_be_seen_and_stays(types, result):
 
 
 def test_result_shows_the_simulated_chain_and_the_error_of_each_point(types, result):
-    found = shown(types, result.trials, result)
+    marks = shown(types, result.trials, result)
     for k, (trial, chains) in enumerate(zip(result.trials, result.chains, strict=True), start=1):
-        simulated, = found[f'trial_{k}/simulated']
+        simulated, = marks[f'trial_{k}/simulated']
         assert np.allclose(points(simulated), chains[0])
-        spheres, lines = found[f'trial_{k}/error']
+        spheres, lines = marks[f'trial_{k}/error']
         assert (spheres.type, lines.type) == (SPHERE_LIST, LINE_LIST)
         errors = np.linalg.norm(chains[0] - trial.goals[0].chain.points, axis=1)
         greens = np.array([colour.g for colour in spheres.colors])
         assert (np.diff(greens[np.argsort(errors)]) <= 1e-6).all()
         ends = points(lines).reshape(-1, 2, 3)
         assert np.allclose(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1), errors)
-        label, = found[f'trial_{k}/label']
+        label, = marks[f'trial_{k}/label']
         assert f'max {measured(errors.max(), "m")}' in label.text
 
 
 def test_trial_that_came_after_the_result_is_shown_as_measured(types, result):
     trials = [*result.trials, toy_trial(TRUTH, 'trial 3', turn=1.0)]
-    found = shown(types, trials, result)
-    assert 'trial_2/simulated' in found
-    assert 'trial_3/goal' in found
-    assert 'trial_3/simulated' not in found
+    marks = shown(types, trials, result)
+    assert 'trial_2/simulated' in marks
+    assert 'trial_3/goal' in marks
+    assert 'trial_3/simulated' not in marks
 
 
 def test_trial_that_only_has_the_name_of_one_of_the_result_is_shown_as_measured(types, result):
@@ -117,15 +117,15 @@ def test_trial_that_only_has_the_name_of_one_of_the_result_is_shown_as_measured(
     assert 'trial_1/simulated' not in shown(types, [other], result)
 
 
-def test_a_tracker_that_goes_on_after_the_result_does_not_hide_what_was_simulated(types, result):
+def test_a_tracker_that_goes_on_after_the_result_does_not_hide_the_simulation(types, result):
     def streamed(trial, count):
         goals = [replace(goal, chain=Chain(goal.chain.points + 1e-5 * count), count=count)
                  for goal in trial.goals]
         return replace(trial, goals=tuple(goals))
 
     calibrated = replace(result, trials=tuple(streamed(trial, 40) for trial in result.trials))
-    found = shown(types, [streamed(trial, 50) for trial in toy_trials(2)], calibrated)
-    assert 'trial_2/simulated' in found
+    marks = shown(types, [streamed(trial, 50) for trial in toy_trials(2)], calibrated)
+    assert 'trial_2/simulated' in marks
 
 
 def test_only_the_mean_of_a_stream_may_differ_between_trials_that_look_alike():
@@ -151,8 +151,8 @@ def test_same_thing_has_the_same_id_in_every_message_and_no_two_share_one(types,
 def test_of_many_goals_a_few_instants_are_shown_the_last_always(types):
     trial, = toy_trials(1)
     goals = [Goal(Chain(trial.initial.points + (0, 0, 0.01 * k)), 0.02 * k, stable=False) for k in range(60)]
-    found = shown(types, [replace(trial, goals=goals)])
-    lines = [marker for marker in found['trial_1/goal'] if marker.type == LINE_STRIP]
+    marks = shown(types, [replace(trial, goals=goals)])
+    lines = [marker for marker in marks['trial_1/goal'] if marker.type == LINE_STRIP]
     assert len(lines) == 5
     assert any(np.allclose(points(marker), goals[-1].chain.points) for marker in lines)
 
@@ -164,7 +164,7 @@ def test_of_many_points_two_hundred_are_shown_from_the_first_to_the_last(types):
     assert np.array_equal(points(initial)[[0, -1]], trial.initial.points[[0, -1]])
 
 
-def test_no_trials_clear_what_was_shown(types):
+def test_markers_are_deleted_when_there_are_no_trials(types):
     assert shown(types, []) == {}
 
 

@@ -70,7 +70,7 @@ def test_session_over_the_graph_gives_a_result_and_the_replay_the_same(start_nod
     robot.until_status(state='collecting', trials='3')
     assert robot.call('start').success
     live = robot.until_result()
-    assert [one.name for one in live.status] == [*PAPER_PARAMETERS, 'calibration']
+    assert [status.name for status in live.status] == [*PAPER_PARAMETERS, 'calibration']
     assert whole(live)['trials'] == '3'
     assert whole(live)['seed'] == '7'
     robot.until(lambda: robot.heard['progress'])
@@ -81,13 +81,13 @@ def test_session_over_the_graph_gives_a_result_and_the_replay_the_same(start_nod
 
     folder, = folders(tmp_path)
     replayed = fitted(folder, capsys)
-    found = result_values(live)
+    result = result_values(live)
     for name, estimate in replayed['parameters'].items():
         for key, value in estimate.items():
-            assert repr(value) == repr(found[name][key]), (name, key)
+            assert repr(value) == repr(result[name][key]), (name, key)
     assert [repr(score) for score in replayed['scores']] == whole(live)['scores'].split()
     written = read_result(folder / 'result.xml')
-    assert written.values == {name: one['value'] for name, one in replayed['parameters'].items()}
+    assert written.values == {name: estimate['value'] for name, estimate in replayed['parameters'].items()}
     page = (folder / 'report.html').read_text(encoding='utf-8')  # closing the node has waited for it
     assert f'dlo-calibration fit {folder.name}' in page
     assert page.count(' seen from above: ') == 3
@@ -95,7 +95,7 @@ def test_session_over_the_graph_gives_a_result_and_the_replay_the_same(start_nod
     assert kinds == {*INPUT_TYPES, *OUTPUT_TYPES}
 
 
-def test_late_listener_gets_all_that_is_latched(start_node):
+def test_a_late_listener_gets_the_latched_messages(start_node):
     robot = start_node()
     robot.send(session_messages(TYPES, 1))
     robot.until_status(trials='1')
@@ -106,7 +106,7 @@ def test_late_listener_gets_all_that_is_latched(start_node):
         robot.node.create_subscription(TYPES.find(OUTPUT_TYPES[name]), f'/calibrator/{name}',
                                        functools.partial(late.__setitem__, name), LATCHED)
     robot.until(lambda: len(late) == 4, 'something is not latched')
-    robot.until(lambda: 'trial_1/simulated' in {one.ns for one in late['markers'].markers},
+    robot.until(lambda: 'trial_1/simulated' in {marker.ns for marker in late['markers'].markers},
                 'the markers do not show the result')
     assert values(late['status'].status[0])['state'] == 'done'
     assert whole(late['result']) == whole(robot.heard['result'][-1])
@@ -252,7 +252,7 @@ def test_signal_while_it_calibrates_ends_cleanly(ros_environment, tmp_path, numb
         assert ended(process) == 0
     folder, = folders(tmp_path / 'out')
     session = read_session(folder)
-    assert session.problems == ()
+    assert session.warnings == ()
     assert {kind for kind, _ in session.messages} == {INITIAL, ACTION, GOAL}
     assert session.outputs('result')  # the best so far is kept
 

@@ -23,6 +23,7 @@ from dlo_calibration.files import recording
 from dlo_calibration.files.record import encode
 from dlo_calibration.files.result import read_description, read_result
 from dlo_calibration.files.session import read_session, session_trials
+from dlo_calibration.inference.trial_information import TrialInformation
 from dlo_calibration.messages.codec import GOAL, INITIAL, INPUT_TYPES, OUTPUT_TYPES
 from dlo_calibration.model.parameters import number
 from dlo_calibration.workspace.folder import calibration_digest
@@ -50,9 +51,9 @@ def folders(path):
 
 def score(command, folder):
     """Return the score that `fit` finds in a session, as a result message has it."""
-    code, found, _ = command('fit', folder, '--json')
+    code, printed, _ = command('fit', folder, '--json')
     assert code == 0
-    return repr(found['score'])
+    return repr(printed['score'])
 
 
 def test_published_messages_are_on_the_disk_before_a_listener_gets_them(start, tmp_path):
@@ -118,10 +119,10 @@ def test_requests_that_do_not_fit_are_refused_and_stop_gives_the_best_so_far(sta
     graph.until(lambda: graph.heard['progress'])
     assert graph.session.request('stop')[0]
     graph.until(lambda: graph.status['state'] == 'done')
-    found = whole(graph.heard['result'][0])
-    assert found['stop_reason'] == 'stopped on request'
-    assert graph.status['detail'] == f"Do not use this result: {found['unusable']}. stopped on request"
-    assert 'the search has not reached a minimum (stopped on request)' in found['unusable']
+    result = whole(graph.heard['result'][0])
+    assert result['stop_reason'] == 'stopped on request'
+    assert graph.status['detail'] == f"{result['headline']} stopped on request"
+    assert 'the search has not reached a minimum (stopped on request)' in result['unusable']
 
 
 def test_reset_forgets_the_trials_and_begins_another_session(start, tmp_path, command):
@@ -170,8 +171,8 @@ def test_log_and_status_are_harmless_and_short_whatever_came(start, text):
     refusal = graph.status['last_refusal']
     assert graph.logged['warn'] == [refusal]
     graph.session.fail(text, 'in the log')
-    for one in (refusal, graph.status['detail']):
-        assert 0 < len(one) <= 300 and one.isprintable()
+    for shown in (refusal, graph.status['detail']):
+        assert 0 < len(shown) <= 300 and shown.isprintable()
 
 
 def test_refusals_for_one_reason_are_counted(start):
@@ -183,7 +184,7 @@ def test_refusals_for_one_reason_are_counted(start):
     assert graph.status['last_refusal'].startswith('goal_chain stamped 236 s: ')
     assert graph.status['last_refusal'].endswith(' (37 times)')
     assert len(graph.logged['warn']) == 1
-    graph.ahead = 2.0
+    graph.elapsed = 2.0
     graph.session.tick()
     assert graph.logged['warn'][1:] == [graph.status['last_refusal']]
 
@@ -196,10 +197,10 @@ def test_a_stream_of_refusals_changes_the_status_at_most_once_a_second(start):
         bad.header.stamp.sec = 200 + k
         graph.send([(GOAL, bad)])
     assert len(graph.heard['status']) - before <= 1
-    graph.ahead += 1.0
+    graph.elapsed += 1.0
     graph.session.tick()
     assert graph.status['last_refusal'].endswith(' (50 times)')
-    graph.send(session_messages(TYPES, 1))  # a trial is told at once
+    graph.send(session_messages(TYPES, 1))  # a trial is reported at once
     assert graph.status['trials'] == '1'
 
 
@@ -222,7 +223,7 @@ def test_a_discarded_trial_is_left_out_by_the_replay_too(start, tmp_path, comman
     assert whole(live)['trials'] == '2'
     folder, = folders(tmp_path)
     assert score(command, folder) == whole(live)['score']
-    assert '6 message(s) of 2 trial(s) that were taken back are left out' in read_session(folder).problems
+    assert '6 message(s) of 2 trial(s) that were taken back are left out' in read_session(folder).warnings
 
 
 def test_no_trial_is_discarded_while_it_calibrates(start):
@@ -247,9 +248,9 @@ def test_goals_of_a_tracker_before_the_first_initial_chain_are_counted_and_no_re
     goal.header.stamp.nanosec = 900_000_000  # it comes later than the initial chain
     graph.send([(GOAL, goal)])
     assert (graph.status['last_refusal'], graph.status['trials']) == ('', '1')
-    told, late = (text for text in graph.logged['info'] if text.startswith('goal_chain'))
+    early, late = (text for text in graph.logged['info'] if text.startswith('goal_chain'))
     assert late.endswith('s: came before the first initial chain; not used')
-    assert told.endswith('and 4 more: came before the first initial chain; not used')
+    assert early.endswith('and 4 more: came before the first initial chain; not used')
 
 
 def test_a_tracker_that_goes_on_leaves_the_state_done(start):
@@ -268,11 +269,11 @@ def test_starts_by_itself_once_the_last_trial_is_quiet_and_only_once(start):
     graph = start(start_after_trials=2)
     graph.send(session_messages(TYPES, 2))
     assert graph.status['state'] == 'collecting'
-    graph.ahead += 1.0
+    graph.elapsed += 1.0
     graph.until(lambda: graph.heard['result'])
     assert whole(graph.heard['result'][0])['trials'] == '2'
     graph.send(session_messages(TYPES, 1, first=2))
-    graph.ahead += 1.0
+    graph.elapsed += 1.0
     graph.session.tick()
     assert graph.status['state'] == 'collecting'
 
@@ -308,7 +309,7 @@ def test_a_scene_that_cannot_be_used_is_refused_at_the_start(start):
 def test_a_scene_that_cannot_be_used_ends_a_start_by_itself(start):
     graph = start(make=make_simulator, scene='nowhere.urdf', start_after_trials=1)
     graph.send(session_messages(TYPES, 1))
-    graph.ahead += 1.0
+    graph.elapsed += 1.0
     graph.session.tick()
     assert graph.status['state'] == 'failed'
     assert graph.status['detail'].startswith('scene nowhere.urdf: ')
@@ -374,13 +375,13 @@ def test_a_full_disk_is_reported_and_the_result_is_still_published(
     assert f'report.html: {os.strerror(errno.ENOSPC)}' in text
     graph.send(session_messages(TYPES, 1))
     graph.calibrated()
-    told = len(graph.logged['error'])
+    count = len(graph.logged['error'])
     graph.session.close()
-    assert len(graph.logged['error']) == told
+    assert len(graph.logged['error']) == count
     _, second = folders(tmp_path)
     assert {file.name for file in second.iterdir()} == {
         'result.xml', 'evaluations.csv', 'report.html', 'metadata.yaml', f'{second.name}_0.mcap'}
-    assert read_session(second).problems == ()
+    assert read_session(second).warnings == ()
 
 
 def test_missing_parts_of_a_session_are_reported_when_the_node_ends(start, tmp_path):
@@ -417,23 +418,24 @@ def test_description_of_the_dlo_is_the_text_of_the_result_file(start, tmp_path):
     graph.send(session_messages(TYPES, 1))
     live = result_values(graph.calibrated())
     text, = (message.data for message in graph.heard['dlo_description'])
-    assert {name: one.physical_value for name, one in read_description(text).parameters.items()} == {
-        name: one['physical_value'] for name, one in live.items()}
+    parameters = read_description(text).parameters
+    assert {name: estimate.physical_value for name, estimate in parameters.items()} == {
+        name: estimate['physical_value'] for name, estimate in live.items()}
     folder, = folders(tmp_path)
     assert text == (folder / 'result.xml').read_text(encoding='utf-8')
 
 
-def test_markers_show_trials_not_too_often_and_then_what_was_simulated(start):
+def test_markers_show_trials_at_intervals_and_then_the_simulation(start):
     graph = start()
 
     def shown():
-        return {one.ns for one in graph.heard['markers'][-1].markers}
+        return {marker.ns for marker in graph.heard['markers'][-1].markers}
 
     graph.send(session_messages(TYPES, 1))
     graph.send(session_messages(TYPES, 1, first=1))
     assert len(graph.heard['markers']) == 1
     assert 'trial_2/goal' not in shown()
-    graph.ahead += 1.3
+    graph.elapsed += 1.3
     graph.session.tick()
     assert {f'trial_{k}/{name}' for k in (1, 2) for name in ('initial', 'goal', 'hands')} <= shown()
     assert not any(space.endswith('/simulated') for space in shown())
@@ -441,7 +443,7 @@ def test_markers_show_trials_not_too_often_and_then_what_was_simulated(start):
     graph.session.tick()  # between the two, services are answered
     assert {'trial_1/simulated', 'trial_2/simulated'} <= shown()
     graph.send(session_messages(TYPES, 1, first=2))
-    graph.ahead += 1.4
+    graph.elapsed += 1.4
     graph.session.tick()
     assert 'trial_3/goal' in shown() and 'trial_1/simulated' in shown()
     assert 'trial_3/simulated' not in shown()
@@ -452,13 +454,13 @@ def test_markers_show_trials_not_too_often_and_then_what_was_simulated(start):
 def test_status_says_whether_a_trial_added_information(start, tmp_path, command):
     graph = start(seed=3)
     graph.send(session_messages(TYPES, 1))
-    graph.ahead += 1.0
+    graph.elapsed += 1.0
     graph.until(lambda: graph.status['last_trial'])
     assert graph.status['last_trial'].startswith('trial 1 makes flexibility more certain (')
     assert graph.heard['status'][-1].status[0].message.endswith(graph.status['last_trial'])
     assert float(graph.status['std_after_flexibility']) < 0.5 * float(graph.status['std_before_flexibility'])
     graph.send(trial_messages(TYPES, toy_trials(1)[0], 2 * MINUTE))  # the same again
-    graph.ahead += 1.0
+    graph.elapsed += 1.0
     graph.until(lambda: graph.status['last_trial'].startswith('trial 2'))
     assert graph.status['last_trial'].startswith('trial 2 adds nothing new: repeat it only to average noise')
     live = graph.calibrated()
@@ -468,15 +470,37 @@ def test_status_says_whether_a_trial_added_information(start, tmp_path, command)
     assert (graph.status['last_trial'], graph.status['trials']) == ('', '0')
 
 
-def test_a_reset_while_a_trial_is_appraised_forgets_it(start):
+def test_information_about_a_trial_that_comes_after_a_newer_trial_is_dropped(start):
+    graph = start(seed=3)
+    graph.send(session_messages(TYPES, 1))
+    graph.elapsed += 1.0
+    graph.until(lambda: graph.status['last_trial'].startswith('trial 1'))
+    graph.send(session_messages(TYPES, 1, first=1))
+    assert (graph.status['trials'], graph.status['last_trial']) == ('2', '')
+    graph.elapsed += 1.0
+    graph.until(lambda: graph.status['last_trial'].startswith('trial 2'))
+    graph.session._live_information.events.put(TrialInformation.unknown('trial 1', ('friction',), 'late'))
+    graph.session.tick()
+    assert graph.status['last_trial'].startswith('trial 2')
+
+
+def test_start_and_result_name_the_same_number_of_evaluations(start):
+    graph = start(search='random', evaluations=7)
+    graph.send(session_messages(TYPES, 2))
+    assert 'at most 7 evaluations' in graph.session.request('start')[1]
+    graph.until(lambda: graph.heard['result'])
+    assert whole(graph.heard['result'][0])['stop_reason'] == 'budget of 7 evaluations spent'
+
+
+def test_a_reset_deletes_information_that_is_being_computed(start):
     toy = Stoppable()
     graph = start(toy)
     graph.send(session_messages(TYPES, 1))
-    graph.ahead += 1.0
-    appraiser = graph.session._appraiser
+    graph.elapsed += 1.0
+    information = graph.session._live_information
     graph.until(toy.begun.is_set)
     assert graph.session.request('reset')[0]
-    graph.until(lambda: not appraiser.alive)
+    graph.until(lambda: not information.alive)
     assert (graph.status['last_trial'], graph.status['trials']) == ('', '0')
 
 
@@ -492,10 +516,10 @@ def test_a_clock_that_went_back_begins_another_session_and_trials_never_mix(star
     graph.send(session_messages(TYPES, 2))
     graph.send(back(session_messages(TYPES, 1), 50))  # within the first trial
     first, second = folders(tmp_path)
-    told = graph.status['last_refusal']
-    assert told.startswith('the clock went back by ')
-    assert told.endswith(f'the 2 trial(s) of the former one are in {first}')
-    assert graph.logged['warn'] == [told]
+    refusal = graph.status['last_refusal']
+    assert refusal.startswith('the clock went back by ')
+    assert refusal.endswith(f'the 2 trial(s) of the former one are in {first}')
+    assert graph.logged['warn'] == [refusal]
     assert (graph.status['state'], graph.status['trials']) == ('collecting', '1')
     live = graph.calibrated()
     assert whole(live)['trials'] == '1'
@@ -518,7 +542,7 @@ def test_a_calibration_goes_on_when_the_clock_goes_back_and_its_result_lies_with
     assert (first / 'result.xml').exists() and not (second / 'result.xml').exists()
     assert score(command, first) == whole(live)['score']
     assert len(read_session(first).outputs('result')) == 1
-    assert read_session(first).problems == ()
+    assert read_session(first).warnings == ()
     assert whole(graph.calibrated())['trials'] == '1'
     assert (second / 'result.xml').exists()
 
@@ -570,10 +594,10 @@ def test_another_session_goes_on_with_the_same_trials_and_options(start, tmp_pat
             assert graph.session.request('stop')[0]
             going_on.set()
         else:
-            told = re.fullmatch(r'goes on after (\d+) evaluations of an interrupted calibration',
+            match = re.fullmatch(r'goes on after (\d+) evaluations of an interrupted calibration',
                                 graph.status['detail'])
-            assert bool(told) == record
-            assert not told or int(told[1]) >= int(whole(results[0])['evaluations'])
+            assert bool(match) == record
+            assert not match or int(match[1]) >= int(whole(results[0])['evaluations'])
         graph.until(lambda graph=graph: graph.status['state'] == 'done')
         results.append(graph.heard['result'][-1])
         assert any('goes on after' in text for text in graph.logged['warn']) == (toy is toys[1])

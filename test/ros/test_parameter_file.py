@@ -37,7 +37,7 @@ def test_file_has_every_parameter_with_its_default(node, kind):
     assert kind.of({name: [] if value == NO_TEXTS else value for name, value in values.items()}) == kind()
 
 
-@pytest.mark.parametrize('node, declaration', DECLARED, ids=lambda one: getattr(one, 'name', one))
+@pytest.mark.parametrize('node, declaration', DECLARED, ids=lambda value: getattr(value, 'name', value))
 def test_comments_give_meaning_unit_and_range(node, declaration):
     lines = parameter_file(node).splitlines()
     at = next(k for k, line in enumerate(lines) if line.startswith(f'    {declaration.name}: '))
@@ -60,7 +60,7 @@ def test_no_line_is_too_long_to_read():
     assert max(len(line) for node in NODES for line in parameter_file(node).splitlines()) <= 110
 
 
-def test_node_starts_with_the_file_and_takes_what_was_changed_in_it(ros_environment, tmp_path):
+def test_node_starts_with_the_file_and_uses_its_changed_values(ros_environment, tmp_path):
     rclpy = pytest.importorskip('rclpy', reason='needs ROS 2, sourced or from PyPI')
     pytest.importorskip('diagnostic_msgs', reason='needs the message packages common_interfaces')
     from rclpy.context import Context

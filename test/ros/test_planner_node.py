@@ -3,20 +3,17 @@
 
 """The planner over a real graph: what robot software sees."""
 
-from contextlib import contextmanager
 from dataclasses import replace
 import json
 import os
 import signal
-import subprocess
-import sys
 
 import numpy as np
 from planner_robot import PlannerRobot
 import pytest
 from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
-from ros_robot import ended, LATCHED, robot_of, TYPES
+from ros_robot import ended, LATCHED, python_process, robot_of, TYPES
 from toy_planner import CHAIN, description, RESULT, ToyPlan
 
 from dlo_calibration import Chain, InputError
@@ -33,10 +30,10 @@ STRING = TYPES.find('std_msgs/msg/String')
 def robot(ros_environment, monkeypatch):
     """Give the robot; the node searches as `start` says."""
     monkeypatch.setattr(planner_session, 'plan', planner_session.plan)  # restores it afterwards
-    with robot_of(ros_environment, PlannerRobot) as one:
-        yield one
-        if one.calibrator is not None:
-            one.calibrator.close()
+    with robot_of(ros_environment, PlannerRobot) as connected:
+        yield connected
+        if connected.calibrator is not None:
+            connected.calibrator.close()
 
 
 def start(robot, plan=None, remapped=(), **parameters):
@@ -56,18 +53,10 @@ def listened(robot):
     return heard
 
 
-@contextmanager
 def child(environment, *arguments):
-    """Run the executable."""
-    process = subprocess.Popen(
-        [sys.executable, '-m', 'dlo_calibration.ros.executable', 'planner', '--ros-args', *arguments],
-        env={**environment, 'PYTHONPATH': os.pathsep.join(sys.path)}, stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE, text=True, start_new_session=True)
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
+    """Run the executable in a process of its own."""
+    return python_process(environment, '-m', 'dlo_calibration.ros.executable', 'planner', '--ros-args',
+                          *arguments)
 
 
 @pytest.mark.long
@@ -120,7 +109,7 @@ def test_a_description_that_was_latched_before_is_heard_and_none_is_published(ro
 def test_a_description_that_is_not_latched_gives_a_warning(robot):
     start(robot)
     robot.node.create_publisher(STRING, '/planner/dlo_description', 1)
-    robot.until(lambda: any('durability transient local' in one.msg for one in robot.heard['log']))
+    robot.until(lambda: any('durability transient local' in entry.msg for entry in robot.heard['log']))
 
 
 def test_a_description_from_a_file_is_published_latched_and_can_be_replaced(robot, tmp_path):

@@ -62,20 +62,20 @@ def test_a_plan_is_published_as_steps_action_and_markers(started):
     graph = started(plan, tolerance=2.0)
     graph.send_chains(CHAIN, MOVED)
     status = graph.planned()
-    (found, start, goal, options, simulation), = plan.calls
+    (described, start, goal, options, simulation), = plan.calls
     assert np.array_equal(start.points, CHAIN.points) and np.array_equal(goal.points, MOVED.points)
     assert options == PlannerOptions(tolerance=2.0)
-    assert found.values == read_result(RESULT).values
+    assert described.values == read_result(RESULT).values
     assert simulation == read_result(RESULT).file_options.options()
     steps, = graph.steps
-    assert [one['name'] for one in steps['actions']] == ['grasp_and_place', 'drag']
+    assert [action['name'] for action in steps['actions']] == ['grasp_and_place', 'drag']
     assert steps.keys() == plain_plan(plan(*plan.calls[0][:4], simulation=None, on_progress=id,
                                            should_stop=bool)).keys()
     assert (status['actions'], status['reached'], status['plans']) == ('2', 'false', '1')
     assert float(status['error_after_mm']) == 1e3 * steps['error_after_m']
     markers = graph.heard['markers'][-1].markers
-    assert {one.header.frame_id for one in markers} == {'table'}
-    assert {one.ns for one in markers[1:]} == {'plan/start', 'plan/goal', 'plan/label', *(
+    assert {marker.header.frame_id for marker in markers} == {'table'}
+    assert {marker.ns for marker in markers[1:]} == {'plan/start', 'plan/goal', 'plan/label', *(
         f'action_{k}/{name}' for k in (1, 2) for name in ('predicted', 'interval', 'hands', 'label'))}
 
 
@@ -91,9 +91,9 @@ def test_the_calibrator_reads_the_published_action_as_that_of_the_plan(started):
     np.testing.assert_allclose(np.column_stack([heard.times, heard.positions[:, 0]]), hand['waypoints'],
                                atol=1e-9)
     collector = TrialCollector(read_result(RESULT).file_options.options())
-    for one in (ChainMessage(INITIAL, MINUTE - SECOND, 'table', CHAIN), heard,
+    for content in (ChainMessage(INITIAL, MINUTE - SECOND, 'table', CHAIN), heard,
                 ChainMessage(GOAL, 2 * MINUTE, 'table', MOVED)):
-        collector.add(one)
+        collector.add(content)
     trial, = collector.trials
     collected, = trial.hands
     assert collected.grips == (hand['grip'],)
@@ -108,26 +108,26 @@ def test_with_a_frame_pose_chains_and_plans_are_in_the_frame_of_the_camera(start
     graph.planned()
     (_, start, goal, *_), = plan.calls
     assert np.allclose(start.points, CHAIN.points) and np.allclose(goal.points, MOVED.points)
-    for one, right in zip(graph.steps[0]['actions'], level.steps[0]['actions'], strict=True):
+    for tilted, right in zip(graph.steps[0]['actions'], level.steps[0]['actions'], strict=True):
         for key in ('predicted', 'waypoints'):
-            found, true = (np.array(each[key] if key in each else each['hands'][0][key])[:, -3:]
-                           for each in (one, right))
-            assert np.allclose(CAMERA.points(found), true)
-        lower, upper = np.array(one['predicted_lower_upper_m'])
-        assert (lower <= one['predicted']).all() and (upper >= one['predicted']).all()
+            planned, level_values = (np.array(each[key] if key in each else each['hands'][0][key])[:, -3:]
+                           for each in (tilted, right))
+            assert np.allclose(CAMERA.points(planned), level_values)
+        lower, upper = np.array(tilted['predicted_lower_upper_m'])
+        assert (lower <= tilted['predicted']).all() and (upper >= tilted['predicted']).all()
         true = np.linalg.norm(np.subtract(*right['predicted_lower_upper_m']), axis=1)
         assert np.allclose(np.linalg.norm(upper - lower, axis=1), true)
-    heard, right = (read(ACTION, one.heard['action'][0]) for one in (graph, level))
+    heard, right = (read(ACTION, planner.heard['action'][0]) for planner in (graph, level))
     assert heard.frame_id == 'camera'
     assert np.allclose(CAMERA.points(heard.positions), right.positions)
-    line, = (one for one in graph.heard['markers'][0].markers if one.ns == 'plan/start')
+    line, = (marker for marker in graph.heard['markers'][0].markers if marker.ns == 'plan/start')
     at, turn = line.pose.position, line.pose.orientation
     seen = Pose([at.x, at.y, at.z], [turn.x, turn.y, turn.z, turn.w]).points(
         np.array([[p.x, p.y, p.z] for p in line.points]))
     assert np.allclose(seen, CAMERA.inverse.points(CHAIN.points))
 
 
-def test_without_a_frame_pose_the_description_tells_how_its_chains_were_read(started):
+def test_without_a_frame_pose_that_of_the_description_is_used(started):
     plan, text = ToyPlan(), RESULT.read_text(encoding='utf-8')
     graph = started(plan)
     graph.hear('dlo_description', description(text.replace(
@@ -173,7 +173,7 @@ def test_a_stream_of_refusals_changes_the_status_at_most_once_a_second(started):
         graph.session.refuse(f'chain stamped {k} s: nothing')
         graph.session.tick()
     assert len(graph.heard['status']) - before <= 1
-    graph.ahead += 1.0
+    graph.elapsed += 1.0
     graph.session.tick()
     assert graph.status['last_refusal'].endswith(' (20 times)')
 
@@ -201,11 +201,12 @@ def test_progress_is_sent_ten_times_a_second_at_most(started):
     graph = started(plan)
     graph.send_chains()
     graph.session.request('plan')
-    assert plan.told.wait(60)
+    assert plan.reported.wait(60)
     for _ in range(50):
-        graph.ahead += 0.01
+        graph.elapsed += 0.01
         graph.session.tick()
-    progress = [{pair.key: pair.value for pair in one.status[0].values} for one in graph.heard['progress']]
+    progress = [{pair.key: pair.value for pair in message.status[0].values}
+                for message in graph.heard['progress']]
     assert 1 <= len(progress) <= 6
     assert progress[-1]['rollouts'] == '99'  # the newest, not the oldest that waits
 
@@ -237,9 +238,9 @@ def test_a_bad_message_is_refused_once_and_the_last_good_one_stays(started, kind
     warning, = graph.logged['warn']
     assert words in warning and warning.count('\n') == 0
     graph.planned()
-    (found, start, goal, *_), = plan.calls
+    (described, start, goal, *_), = plan.calls
     assert np.array_equal(start.points, CHAIN.points) and np.array_equal(goal.points, MOVED.points)
-    assert found.values == read_result(RESULT).values
+    assert described.values == read_result(RESULT).values
 
 
 def test_bytes_that_are_no_message_are_refused(started):
@@ -266,7 +267,7 @@ def test_of_a_fast_stream_few_chains_are_read_and_the_newest_is_planned_with(sta
     graph.send_chains()
     before = graph.decoded
     for k in range(300):  # ten seconds
-        graph.ahead += 1 / 30
+        graph.elapsed += 1 / 30
         graph.hear('chain', cloud(Chain(CHAIN.points + (0.0, 1e-3 * k, 0.0)), MINUTE + k + 1))
         graph.session.tick()
     assert graph.decoded - before <= 70

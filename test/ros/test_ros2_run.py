@@ -86,7 +86,7 @@ def interrupted(command, environment, folder, node='calibrator'):
     return said, process.returncode
 
 
-def test_the_index_leads_to_what_was_built(environment, prefix):
+def test_the_ament_index_leads_to_the_installed_package(environment, prefix):
     assert Path(index.get_package_prefix(NAME)) == prefix
     program = f'from {NAME}.simulation.core import _core; print(_core.__file__)'
     done = subprocess.run([sys.executable, '-c', program], cwd='/', env=environment, capture_output=True,

@@ -21,14 +21,14 @@ CAMERA = Pose([0.2, -0.1, 1.5], [0.95, 0.05, 0.02, 0.3])
 
 
 class Buffer:
-    """The part of tf2_ros.Buffer that is used; it knows what a test puts into `known`."""
+    """The part of tf2_ros.Buffer that is used; it knows what a test puts into `poses`."""
 
-    known = {}
+    poses = {}
 
     def lookup_transform(self, target, source, _):
-        if (target, source) not in self.known:
+        if (target, source) not in self.poses:
             raise LookupError(f'"{target}" passed to lookupTransform argument target_frame does not exist')
-        pose = self.known[target, source]
+        pose = self.poses[target, source]
         return SimpleNamespace(transform=SimpleNamespace(
             translation=SimpleNamespace(**dict(zip('xyz', pose.position, strict=True))),
             rotation=SimpleNamespace(**dict(zip('xyzw', pose.orientation, strict=True)))))
@@ -40,9 +40,9 @@ def tf2(monkeypatch):
     module = ModuleType('tf2_ros')
     module.Buffer, module.TransformException = Buffer, LookupError
     module.TransformListener = lambda buffer, node: None
-    monkeypatch.setattr(Buffer, 'known', {})
+    monkeypatch.setattr(Buffer, 'poses', {})
     monkeypatch.setitem(sys.modules, 'tf2_ros', module)
-    return Buffer.known
+    return Buffer.poses
 
 
 def test_messages_wait_for_the_transform_and_are_then_in_the_tables_frame(ros_environment, tmp_path, tf2):
@@ -61,7 +61,7 @@ def test_messages_wait_for_the_transform_and_are_then_in_the_tables_frame(ros_en
     assert np.allclose(session.trials[0].initial.points, trial.initial.points, atol=1e-9)
 
 
-def test_what_came_before_the_name_was_set_waits_for_the_transform_too(ros_environment, tmp_path, tf2):
+def test_messages_from_before_the_frame_was_named_wait_for_the_transform_too(ros_environment, tmp_path, tf2):
     from rclpy.parameter import Parameter
 
     with live_node(ros_environment, tmp_path) as robot:
@@ -73,8 +73,8 @@ def test_what_came_before_the_name_was_set_waits_for_the_transform_too(ros_envir
         assert answer.message == 'no pose of their frame came yet; start follows when they are read'
         tf2['table', 'camera'] = CAMERA
         robot.until_result()
-        found = robot.calibrator.session.collecting.collector.trials[0]
-        assert np.allclose(found.initial.points, trial.initial.points, atol=1e-9)
+        collected = robot.calibrator.session.collecting.collector.trials[0]
+        assert np.allclose(collected.initial.points, trial.initial.points, atol=1e-9)
 
 
 def test_without_tf2_a_name_is_refused_in_one_sentence(ros_environment, tmp_path, monkeypatch):
@@ -84,7 +84,7 @@ def test_without_tf2_a_name_is_refused_in_one_sentence(ros_environment, tmp_path
             pass
 
 
-def test_a_new_table_height_counts_for_what_comes_next(ros_environment, tmp_path):
+def test_a_new_table_height_applies_to_the_next_messages(ros_environment, tmp_path):
     from rclpy.parameter import Parameter
 
     with live_node(ros_environment, tmp_path) as robot:
@@ -120,7 +120,8 @@ def test_a_stream_is_collected_anew_while_services_answer_and_a_start_waits_for_
         assert robot.calibrator.set_parameters([pose])[0].successful
         robot.calibrator._work()
         robot.calibrator.session.tick()
-        robot.until(lambda: any('anew' in values(one.status[0])['detail'] for one in robot.heard['status']))
+        robot.until(lambda: any('anew' in values(message.status[0])['detail']
+                                for message in robot.heard['status']))
         answer = robot.call('start')
         assert answer.success
         assert re.fullmatch('[0-9]+ messages came before; start follows when they are read', answer.message)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Bounded least squares against SciPy's, and where the solution is known."""
+"""Bounded least squares against SciPy's, and against known solutions."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ def test_the_solution_costs_no_more_than_that_of_scipy(seed):
     unknowns = int(generator.integers(1, 13))
     matrix = generator.standard_normal((unknowns + int(generator.integers(0, 6)), unknowns))
     matrix *= 10**generator.uniform(-3, 1, unknowns)
-    if seed % 3 == 0 and unknowns > 1:  # two unknowns that cannot be told apart
+    if seed % 3 == 0 and unknowns > 1:  # two unknowns with the same column
         matrix[:, 1] = matrix[:, 0]
     right = 10**generator.uniform(-3, 2) * generator.standard_normal(len(matrix))
     least, most = -10**generator.uniform(-2, 1, unknowns), 10**generator.uniform(-2, 1, unknowns)
@@ -29,12 +29,12 @@ def test_the_solution_costs_no_more_than_that_of_scipy(seed):
         assert ours == pytest.approx(theirs, rel=1e-6, abs=1e-9)
 
 
-def test_bounds_hold_exactly_and_what_is_free_makes_up_for_them():
+def test_bounds_hold_exactly_and_free_unknowns_compensate():
     matrix, right = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([3.0, 0.5])
-    found = bounded_least_squares(matrix, right, np.array([-1.0, -1.0]), np.array([1.0, 5.0]))
-    assert found[0] == 1.0 and found[1] == pytest.approx(1.25)
+    solution = bounded_least_squares(matrix, right, np.array([-1.0, -1.0]), np.array([1.0, 5.0]))
+    assert solution[0] == 1.0 and solution[1] == pytest.approx(1.25)
 
 
-def test_without_unknowns_there_is_nothing_to_find():
+def test_without_unknowns_the_solution_is_empty():
     nothing = np.zeros(0)
     assert bounded_least_squares(np.zeros((3, 0)), np.ones(3), nothing, nothing).shape == (0,)

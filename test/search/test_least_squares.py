@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What least squares promises by itself: few evaluations, the lower minimum, no pull by outliers."""
+"""Least squares: few evaluations, the lower minimum, no pull by outliers."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +11,7 @@ import pytest
 
 from dlo_calibration.calibration.calibrate import searched
 from dlo_calibration.calibration.choice import choose
-from dlo_calibration.calibration.prior import prior
+from dlo_calibration.calibration.prior import Prior
 from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.evaluation.evaluation import Evaluator
 from dlo_calibration.files.session import read_session
@@ -54,19 +54,19 @@ def solve(residuals_at, seed=1, budget=150, dimension=3, hints=None):
 
 @pytest.mark.parametrize('roughness', [0.0, 1e-4, 1e-2])
 def test_it_converges_in_few_evaluations_to_one_point_from_any_seed(roughness):
-    found, counts = [], []
+    best, counts = [], []
     for seed in range(8):
         search, asked = solve(lambda point: valley(point, roughness=roughness), seed)
         assert search.stop_reason.startswith('converged')
-        found.append(search.best)
+        best.append(search.best)
         counts.append(len(asked))
-    assert np.ptp(found, axis=0).max() < 0.003
-    assert np.mean(found, axis=0) == pytest.approx(TRUTH, abs=0.003)
+    assert np.ptp(best, axis=0).max() < 0.003
+    assert np.mean(best, axis=0) == pytest.approx(TRUTH, abs=0.003)
     assert np.median(counts) < 45
 
 
 def kinked(point):
-    """Return residuals [m] of the valley with kinks in every parameter, as of what sticks and slips."""
+    """Return residuals [m] of the valley with kinks in every parameter, as by stick and slip."""
     saw = np.abs((np.asarray(point) / 0.08) % 1 * 2 - 1)
     return valley(point + 0.03 * saw)
 
@@ -80,11 +80,11 @@ def test_kinks_do_not_keep_a_seed_in_a_worse_minimum():
 
 
 def test_outliers_do_not_pull():
-    found = solve(lambda point: valley(point, outliers=0.3))[0].best
-    assert found == pytest.approx(TRUTH, abs=0.005)
+    best = solve(lambda point: valley(point, outliers=0.3))[0].best
+    assert best == pytest.approx(TRUTH, abs=0.005)
 
 
-def test_the_lower_of_two_minima_is_found_from_any_seed():
+def test_any_seed_leads_to_the_lower_of_two_minima():
     for seed in range(12):
         search = solve(two_minima, seed, dimension=2)[0]
         assert search.best == pytest.approx([0.2, 0.3], abs=0.02), f'seed {seed}'
@@ -105,27 +105,27 @@ def test_a_parameter_with_only_a_random_effect_stays():
     assert search.best[1] in asked[:8, 1]
 
 
-def test_the_first_point_asked_keeps_to_the_estimate_and_others_do_not():
+def test_some_points_have_the_estimate_and_others_do_not():
     hints = Hints([0.9, np.nan, 0.1], [True] * 3)
     asked = LeastSquares(3, 1, hints).ask(100)
-    kept = (asked[:, [0, 2]] == [0.9, 0.1]).all(axis=1)
-    assert 0 < kept.sum() < len(asked)
+    with_estimate = (asked[:, [0, 2]] == [0.9, 0.1]).all(axis=1)
+    assert 0 < with_estimate.sum() < len(asked)
     wrong = Hints([0.1, np.nan, np.nan], [True] * 3)
     assert solve(valley, hints=wrong)[0].best == pytest.approx(TRUTH, abs=0.005)
 
 
-def test_an_optimum_on_the_border_is_found():
+def test_an_optimum_on_the_border_is_reached():
     search = solve(lambda point: valley(point * [0.5, 1, 1]))[0]  # its minimum is at 1.24
     assert search.best[0] == 1.0
     assert search.stop_reason.startswith('converged')
 
 
 def test_two_starts_that_share_an_estimate_and_end_alike_do_not_hide_a_better_place():
-    # Of sample object2, both end where the DLO stretches too easily, and less friction makes up for it.
+    # On sample object2, both end with too much stretch, for which less friction compensates.
     session = read_session(Path(__file__).resolve().parents[2] / 'msg_samples/object2', None)
     trials, options = session.trials, session.options
     evaluator = Evaluator(trials, options.space, CompiledSimulator())
-    search = LeastSquares(options.space.dimension, 10, prior(trials, options).hints)
+    search = LeastSquares(options.space.dimension, 10, Prior.of(trials, options).hints)
     while len(points := search.ask(150)):
         search.tell([Observation(e.point, e.score, e.residuals)
                      for e in (evaluator.evaluate(0, point) for point in points)])
@@ -167,8 +167,8 @@ def test_a_descent_does_not_stall_in_the_valley_that_a_missing_lift_leaves(name,
     trials = tuple(trial for k, trial in enumerate(session.trials) if k != 2)
     options = choose(trials, session.options).options
     flexibility = []
-    for one in (1, seed):
-        setting = Setting(trials, replace(options, seed=one), CompiledSimulator())
-        best = searched(setting, prior(setting.trials, setting.options)).best
+    for each in (1, seed):
+        setting = Setting(trials, replace(options, seed=each), CompiledSimulator())
+        best = searched(setting, Prior.of(setting.trials, setting.options)).best
         flexibility.append(best.values['flexibility'])
     assert flexibility[1] == pytest.approx(flexibility[0], abs=5)

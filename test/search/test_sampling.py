@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What CMA-ES promises by itself."""
+"""CMA-ES, beyond the contract of every search."""
 
 import sys
 
@@ -15,7 +15,7 @@ TRUTH = np.array([0.62, 0.35])
 
 
 def solve(search, residuals_at, budget=300, unit=1.0):
-    """Tell the search what it asks for; return the points asked."""
+    """Evaluate what the search asks for; return the points asked."""
     asked = []
     while len(asked) < budget:
         points = search.ask(budget - len(asked))
@@ -32,11 +32,11 @@ def bowl(point):
 
 
 @pytest.mark.parametrize('unit', [1e-6, 1e6])
-def test_the_evolution_strategy_does_not_care_for_the_unit_of_the_score(unit):
+def test_the_unit_of_the_score_does_not_matter(unit):
     pytest.importorskip('cma')
-    one, other = CmaEs(2, 3), CmaEs(2, 3)
-    assert solve(one, bowl).tobytes() == solve(other, bowl, unit=unit).tobytes()
-    assert one.stop_reason.startswith('converged')
+    usual, other = CmaEs(2, 3), CmaEs(2, 3)
+    assert solve(usual, bowl).tobytes() == solve(other, bowl, unit=unit).tobytes()
+    assert usual.stop_reason.startswith('converged')
 
 
 def test_the_evolution_strategy_prints_nothing(capfd):

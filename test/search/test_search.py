@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""One contract for every search method, and what the paper's promises by itself."""
+"""One contract for every search method, and the properties of the paper's."""
 
 from importlib.util import find_spec
 
@@ -13,14 +13,14 @@ from dlo_calibration.search import Hints, Observation, SEARCHES
 NAMES = [pytest.param(name, marks=pytest.mark.skipif(
     name == 'cma_es' and find_spec('cma') is None, reason='the library cma is not installed'))
     for name in SEARCHES]
-MEASURED = [name for name in NAMES if name.values != ('random',)]  # that use what they are told
+MEASURED = [name for name in NAMES if name.values != ('random',)]  # those that use the observations
 
 
 class Problem:
     """
     Residuals in a curved valley of the unit cube; parameters listed in `flat` have no effect.
 
-    :param fails: the whole of it cannot be simulated.
+    :param fails: every evaluation fails.
     """
 
     def __init__(self, dimension, flat=(), fails=False, fails_below=-1.0):
@@ -91,7 +91,7 @@ def test_another_seed_gives_other_points(name):
 
 
 @pytest.mark.parametrize('name', NAMES)
-def test_numpys_shared_random_numbers_are_left_alone(name):
+def test_numpys_shared_random_numbers_are_not_used(name):
     np.random.seed(3)
     wanted = np.random.random()
     np.random.seed(3)
@@ -100,7 +100,7 @@ def test_numpys_shared_random_numbers_are_left_alone(name):
 
 
 @pytest.mark.parametrize('name', NAMES)
-def test_points_do_not_depend_on_how_the_asking_is_split(name):
+def test_points_do_not_depend_on_the_limits_of_ask(name):
     whole = walk(name, 4, 9, 60)
     split = walk(name, 4, 9, 60, limits=(1, 2, 13))
     assert whole[1].tobytes() == split[1].tobytes()
@@ -115,7 +115,7 @@ def test_a_new_search_has_its_name_and_no_result(name):
 
 
 @pytest.mark.parametrize('name', NAMES)
-def test_a_search_goes_on_elsewhere_if_all_its_points_fail(name):
+def test_a_search_continues_elsewhere_if_all_its_points_fail(name):
     search, asked = walk(name, 2, 0, 40, problem=Problem(2, fails=True))
     assert np.isfinite(asked).all()
     assert len(np.unique(asked, axis=0)) == len(asked) > 10
@@ -123,7 +123,7 @@ def test_a_search_goes_on_elsewhere_if_all_its_points_fail(name):
 
 
 @pytest.mark.parametrize('name', MEASURED)
-def test_a_search_avoids_failures_and_finds_the_optimum_beside_them(name):
+def test_a_search_avoids_failures_and_reaches_the_optimum_beside_them(name):
     problem = Problem(2)
     problem.fails_below = problem.truth[0] - 0.01
     search = walk(name, 2, 1, 150, problem=problem)[0]
@@ -132,7 +132,7 @@ def test_a_search_avoids_failures_and_finds_the_optimum_beside_them(name):
 
 @pytest.mark.parametrize('dimension', [1, 2, 3])
 @pytest.mark.parametrize('name', MEASURED)
-def test_the_optimum_of_a_curved_valley_is_found(name, dimension):
+def test_the_optimum_of_a_curved_valley_is_reached(name, dimension):
     problem = Problem(dimension)
     for seed in range(3):
         search, asked = walk(name, dimension, seed, 300, problem=problem)
@@ -150,14 +150,14 @@ def test_a_parameter_without_effect_does_not_disturb_the_others(name):
 
 
 @pytest.mark.parametrize('name', MEASURED)
-def test_where_nothing_has_an_effect_it_ends(name):
+def test_a_search_ends_if_no_parameter_has_an_effect(name):
     search, asked = walk(name, 2, 1, 300, problem=Problem(2, flat=(0, 1)))
     assert search.stop_reason
     assert len(asked) < 100
 
 
 @pytest.mark.parametrize('name', MEASURED)
-def test_a_hint_is_where_it_begins(name):
+def test_a_search_begins_at_a_hint(name):
     hints = Hints([0.7, np.nan], [True, True])
     asked = walk(name, 2, 1, 20, hints=hints)[1]
     assert np.abs(asked[:6, 0] - 0.7).min() < 0.35
@@ -169,11 +169,6 @@ def test_a_hint_is_where_it_begins(name):
 def test_empty_hints_change_nothing(name):
     assert walk(name, 3, 1, 30)[1].tobytes() == walk(name, 3, 1, 30, hints=Hints.none(3))[1].tobytes()
 
-
-def test_random_points_do_not_depend_on_how_the_asking_is_split():
-    whole = walk('random', 4, 9, 60)[1]
-    split = walk('random', 4, 9, 60, limits=(1, 2, 13))[1]
-    assert whole.tobytes() == split.tobytes()
 
 
 def test_random_points_are_uniform_and_independent():

@@ -91,12 +91,12 @@ PHYSICAL = {**STIFF, 'flexibility': 1e-4, 'mass': 0.03, 'damping': 1.0}
 
 
 @pytest.mark.parametrize('radius', [
-    0.003, *(pytest.param(one, marks=pytest.mark.long) for one in (0.005, 0.01))])
+    0.003, *(pytest.param(thick, marks=pytest.mark.long) for thick in (0.005, 0.01))])
 def test_a_rope_laid_over_a_peg_hangs_over_it(scene, radius):
     simulator = BulletSimulator(scene=scene(PEG))
-    found = simulator.simulate(dropped(0.36), {**PHYSICAL, 'self_collision': radius})
-    chain = found.chains[0]
-    assert found.settled == (True,)
+    rollout = simulator.simulate(dropped(0.36), {**PHYSICAL, 'self_collision': radius})
+    chain = rollout.chains[0]
+    assert rollout.settled == (True,)
     # It touches with its own radius, and no point of it is inside.
     assert chain[15, 2] == pytest.approx(0.33 + radius, abs=1e-3)
     assert np.linalg.norm(chain[:, [0, 2]] - (0.3, 0.3), axis=1).min() > 0.03 + radius - 1e-3
@@ -167,7 +167,7 @@ def test_a_hollow_mesh_is_hollow(scene):
     simulator.close()
 
 
-def test_a_mesh_that_would_end_pybullet_is_refused_in_silence(scene, capfd):
+def test_a_mesh_that_would_end_pybullet_is_refused_without_output(scene, capfd):
     for text in ('solid nonsense', 'v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 99999'):
         scene(text, 'mesh.obj')
         with pytest.raises(InputError, match="scene .*scene.urdf: the mesh 'mesh.obj': "):
@@ -184,7 +184,7 @@ def test_a_mesh_does_the_same_as_with_pybullets_own_reader(scene, monkeypatch):
                  + ''.join(f'f {" ".join(map(str, quad))}\n' for quad in quads), 'mesh.obj')
     path = scene(MESH.replace('"mesh.obj"', '"mesh.obj" scale="0.7 0.5 1.3"').replace(
         '<geometry>', '<origin xyz="-0.05 -0.2 0.2"/><geometry>'))
-    shape_of, found = pybullet.createCollisionShape, []
+    shape_of, chains = pybullet.createCollisionShape, []
 
     def theirs(*plane, **shape):
         return shape_of(*plane, **{**shape, **({'fileName': file} if 'fileName' in shape else {})})
@@ -192,10 +192,10 @@ def test_a_mesh_does_the_same_as_with_pybullets_own_reader(scene, monkeypatch):
     for make in (shape_of, theirs):
         monkeypatch.setattr(pybullet, 'createCollisionShape', make)
         simulator = BulletSimulator(scene=path, settle_limit=1.0)
-        found.append(simulator.simulate(dropped(0.25), PHYSICAL).chains)
+        chains.append(simulator.simulate(dropped(0.25), PHYSICAL).chains)
         simulator.close()
-    assert found[0][0, :, 2].min() > 0.15
-    assert found[0].tobytes() == found[1].tobytes()
+    assert chains[0][0, :, 2].min() > 0.15
+    assert chains[0].tobytes() == chains[1].tobytes()
 
 
 def test_a_scene_stands_where_pybullets_own_importer_puts_it(scene, capfd):
@@ -275,7 +275,7 @@ def test_a_gripper_holds_the_rope_inside_of_a_link_without_stretching_it(world):
     assert np.linalg.norm(rope.points[0] - begun[0] - (0, 0, 0.3)) < 0.03  # nothing pushes it out
 
 
-def test_what_a_gripper_let_go_touches_it_again_once_it_was_clear(world):
+def test_a_released_rope_touches_the_gripper_again_once_it_was_clear_of_it(world):
     rope = BulletRope.of(world, Chain(line((0, 0, 0.3), (1, 0, 0), 0.06, 5)), PHYSICAL, nodes=5)
     body = hand(world, [(0.03, 0, 0.3)])
     rope.grip(body, -1, (-0.03, 0, 0))
@@ -289,9 +289,9 @@ def test_what_a_gripper_let_go_touches_it_again_once_it_was_clear(world):
 
 
 def test_a_gripper_turns_a_rope_that_resists_twist_about_its_axis(world):
-    """It is the same as `hold` with the turns of the hand."""
+    """The result is that of `hold` with the turns of the hand."""
     twisting = {**PHYSICAL, 'torsion': 1e-4, 'natural_curvature': 5.0}
-    found = []
+    ends = []
     for gripped in (False, True):
         rope = BulletRope.of(world, Chain(line((0, 0, 1), (1, 0, 0), 0.3, 11)), twisting, nodes=11,
                              group=1 << (6 + gripped))
@@ -309,10 +309,10 @@ def test_a_gripper_turns_a_rope_that_resists_twist_about_its_axis(world):
                 rope.step()
             else:
                 rope.step(begun[:2], np.array([each, each]))
-        found.append(rope.points)
+        ends.append(rope.points)
         rope.remove()
-    np.testing.assert_allclose(*found, atol=1e-6)
-    assert np.ptp(found[0][:, 1]) > 1e-3  # it was turned aside
+    np.testing.assert_allclose(*ends, atol=1e-6)
+    assert np.ptp(ends[0][:, 1]) > 1e-3  # it was turned aside
 
 
 def test_a_gripper_away_from_the_rope_is_refused(world):

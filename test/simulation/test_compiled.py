@@ -39,7 +39,7 @@ def some_properties(generator, curvature):
 @drawing(40, derandomize=True)
 @given(st.integers(0, 2**32 - 1), st.integers(2, 40), st.integers(0, 5),
        st.one_of(st.just(0.0), st.floats(0.01, 10)), st.floats(0.02, 0.3))
-def test_the_compiled_step_is_that_of_the_rod(seed, segments, held, curvature, size):
+def test_a_step_is_that_of_the_numpy_rod(seed, segments, held, curvature, size):
     generator = np.random.default_rng(seed)
     rest = generator.uniform(0.01, 0.05, segments)
     points = crumpled(seed, rest, size)
@@ -51,14 +51,14 @@ def test_the_compiled_step_is_that_of_the_rod(seed, segments, held, curvature, s
     follow = generator.normal(size=(len(nodes), 3))
     rod = SteppedRod(rest, some_properties(generator, curvature), STEP, generator.uniform(0, 1, count))
     rod.hold(nodes)
-    got = rod.velocities(points, velocities, GRAVITY, follow)
+    simulated = rod.velocities(points, velocities, GRAVITY, follow)
     expected = oracles.rod_velocities(rod.state, points, velocities + STEP * GRAVITY)
-    assert np.abs(got - expected).max() < 1e-8 * max(1, np.abs(expected).max())
+    assert np.abs(simulated - expected).max() < 1e-8 * max(1, np.abs(expected).max())
 
 
 @drawing(40, derandomize=True)
 @given(st.integers(0, 2**32 - 1), st.integers(8, 30), st.floats(0.003, 0.02), st.floats(0, 2), st.booleans())
-def test_the_compiled_contacts_are_those_of_the_capsules(seed, segments, radius, friction, supported):
+def test_contacts_are_those_of_the_numpy_capsules(seed, segments, radius, friction, supported):
     generator = np.random.default_rng(seed)
     rest = np.full(segments, 0.02)
     turns = np.cumsum(generator.normal(0, 0.6, segments))  # a tangle in a thin layer
@@ -67,11 +67,14 @@ def test_the_compiled_contacts_are_those_of_the_capsules(seed, segments, radius,
     velocities = generator.normal(0, 0.5, points.shape)
     inverse = generator.uniform(0.5, 2, len(points)) * (generator.random(len(points)) > 0.1)
     support = generator.normal(0, 0.05, points.shape) * supported
-    touching = Touching(np.concatenate([[0.0], np.cumsum(rest)]), radius, friction, STEP)
-    touching.start(points + generator.normal(0, 0.002, points.shape))
-    expected = oracles.kept_apart(touching.rope.state, friction, points, velocities, inverse, support, STEP)
-    got = touching.velocities(points, velocities, inverse, support)
-    assert got == pytest.approx(expected, abs=1e-9)
+    places = np.concatenate([[0.0], np.cumsum(rest)])
+    begun = points + generator.normal(0, 0.002, points.shape)
+    touching = Touching(places, radius, friction, STEP)
+    touching.start(begun)
+    expected = oracles.without_penetration(
+        places, begun, radius, friction, points, velocities, inverse, support, STEP)
+    simulated = touching.velocities(points, velocities, inverse, support)
+    assert simulated == pytest.approx(expected, abs=1e-9)
 
 
 def sample(name, marked=()):
@@ -85,22 +88,22 @@ def sample(name, marked=()):
 
 
 @pytest.mark.parametrize('name', ['object2', 'object4'])
-def test_a_trial_is_what_it_is_in_bullet(name):
+def test_rollouts_are_those_of_bullet(name):
     trials, options = sample(name, (3, 10))
     generator = np.random.default_rng(5)
     space = ParameterSpace(NAMES, {}, options.mass)
     with_table = {'table': True, 'table_height': options.table_height, 'settle_limit': 1.0}
     bullet, compiled = BulletSimulator(**with_table), CompiledSimulator(**with_table)
     for trial in trials[:3]:
-        # A DLO that is too long for where it lies buckles, one that is far more curved at rest is flung
-        # about, strands stick or slip: any rounding decides to which side.
+        # Rounding decides to which side a DLO buckles if it is too long for its place, where it is flung if
+        # it is far more curved at rest, and whether strands stick or slip.
         values = {**space.values(generator.random(len(NAMES))), 'length_scale': generator.uniform(30, 48),
                   'natural_curvature': generator.uniform(0, 20), 'bending_friction': 0.0,
                   **dict(zip(REST_SHAPE[1:], generator.uniform(48, 52, len(REST_SHAPE) - 1), strict=True))}
         physical = {**space.physical(values, trial.initial.length), 'self_collision': 0.004}
-        expected, got = (one.simulate(trial, physical) for one in (bullet, compiled))
-        assert np.linalg.norm(got.chains - expected.chains, axis=-1).mean() < 1e-6
-        assert (got.steps, got.settled) == (expected.steps, expected.settled)
+        expected, rollout = (engine.simulate(trial, physical) for engine in (bullet, compiled))
+        assert np.linalg.norm(rollout.chains - expected.chains, axis=-1).mean() < 1e-6
+        assert (rollout.steps, rollout.settled) == (expected.steps, expected.settled)
     bullet.close()
 
 
@@ -113,7 +116,7 @@ def test_a_rollout_that_diverges_ends_at_once():
     assert core.roll_out([(script, start, physical, NO_TABLE)], STEP) == [None]
 
 
-def test_a_layout_is_known_until_the_simulator_is_closed():
+def test_trials_that_differ_in_features_only_have_layouts_of_their_own():
     trials, options = sample('object2')
     simulator = CompiledSimulator(settle_limit=0.5)
     physical = ParameterSpace(mass=options.mass).physical({}, 0.5)

@@ -15,41 +15,41 @@ from test_rod import crumpled, energy, FREE, NONE, straight
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.simulation.bullet import BulletRope, pybullet
 
-STIFFNESS, KEPT, SLIP = 1e-3, 2.0, 0.5
+STIFFNESS, FRICTION, SLIP = 1e-3, 2.0, 0.5
 
 
 def moments(curvatures, steps=50):
     """Return the moment [N m] of friction at the middle of three nodes that are bent to each curvature."""
     length = 0.05
-    physical = properties(STIFFNESS, 1e4, 0.01, bending_friction=KEPT, bending_slip=SLIP)
+    physical = properties(STIFFNESS, 1e4, 0.01, bending_friction=FRICTION, bending_slip=SLIP)
     rod = Rod(np.full(2, length), physical, 1e-9)
-    found, before = [], 0.0
+    friction_moments, before = [], 0.0
     for curvature in curvatures:
         for now in np.linspace(before, curvature, steps + 1)[1:]:
             angle = length * now / 2
             end = length * np.array([np.cos(angle), np.sin(angle), 0])
             points = np.array([end * (-1, 1, 1), (0, 0, 0), end])
             rod.velocities(points, np.zeros_like(points), NONE, FREE)
-        found.append(-rod.state.strand_forces[1, 4] / 1e-9 * length / 2)
+        friction_moments.append(-rod.state.strand_forces[1, 4] / 1e-9 * length / 2)
         before = curvature
-    return np.array(found)
+    return np.array(friction_moments)
 
 
 def test_moment_and_curvature_go_around_a_closed_loop():
     up = np.linspace(0, 4, 81)
     virgin = moments(up)
-    assert virgin[[1, -1]] == pytest.approx(STIFFNESS * KEPT * np.array([0.05 / SLIP, 1.0]), rel=0.01)
+    assert virgin[[1, -1]] == pytest.approx(STIFFNESS * FRICTION * np.array([0.05 / SLIP, 1.0]), rel=0.01)
     cycle = np.concatenate([up, up[::-1][1:], -up[1:], -up[::-1][1:], up[1:]])
     moment = moments(cycle)
     # Masing: the curve of unloading is that of loading, twice as large, from the point of reversal.
     doubled = np.interp(np.arange(161) / 2, np.arange(81), virgin)
-    assert moment[80:241] == pytest.approx(moment[80] - 2 * doubled, abs=0.01 * STIFFNESS * KEPT)
+    assert moment[80:241] == pytest.approx(moment[80] - 2 * doubled, abs=0.01 * STIFFNESS * FRICTION)
     assert moment[-1] == pytest.approx(moment[80])  # closed
     area = np.sum((moment[81:] + moment[80:-1]) / 2 * np.diff(cycle[80:]))
-    assert area == pytest.approx(4 * STIFFNESS * KEPT * (4 - SLIP), rel=0.02)  # lost in each cycle
+    assert area == pytest.approx(4 * STIFFNESS * FRICTION * (4 - SLIP), rel=0.02)  # lost in each cycle
 
 
-def test_the_loop_does_not_depend_on_the_rate():
+def test_the_loop_is_independent_of_the_rate():
     curvatures = np.array([1.0, 0.2, 0.9, -2.0, 0.3, 3.0])
     assert moments(curvatures, 2000) == pytest.approx(moments(curvatures, 1000), rel=2e-3)
 
@@ -63,10 +63,10 @@ def stored(rod):
 @drawing(20, derandomize=True)
 @given(st.integers(0, 2**32 - 1), st.floats(1e-5, 0.1), st.floats(0.1, 30), st.floats(0.001, 10),
        st.sampled_from([0.001, 0.004, 0.01]))
-def test_friction_never_gains_energy(seed, bending, kept, slip, step):
+def test_friction_never_gains_energy(seed, bending, friction, slip, step):
     generator = np.random.default_rng(seed)
     rest = generator.uniform(0.02, 0.05, 15)
-    physical = properties(bending, 1e3, 0.05, bending_friction=kept, bending_slip=slip)
+    physical = properties(bending, 1e3, 0.05, bending_friction=friction, bending_slip=slip)
     rod = Rod(rest, physical, step)
     points = crumpled(seed, rest, 0.05)
     velocities = generator.normal(0, 0.1, points.shape)
@@ -83,14 +83,14 @@ def test_friction_never_gains_energy(seed, bending, kept, slip, step):
     assert before + stored(rod) < start
 
 
-@pytest.mark.parametrize('kept', [0.0, 2.0, 5.0])
-def test_a_bend_stays_on_a_table(kept):
+@pytest.mark.parametrize('friction', [0.0, 2.0, 5.0])
+def test_a_bend_stays_on_a_table(friction):
     """An arc of 12 1/m is let go: it opens slowly, up to the curvature whose moment friction bears."""
     count, length = 30, 0.3
     places = np.linspace(0, length, count + 1)
     points = np.stack([places, np.zeros(count + 1), np.zeros(count + 1)], axis=1)
     physical = {**ParameterSpace().physical({}, length), 'flexibility': 2e-3, 'mass': 0.02, 'damping': 200.0,
-                'friction': 0.0, 'bending_friction': kept, 'bending_slip': 0.2}
+                'friction': 0.0, 'bending_friction': friction, 'bending_slip': 0.2}
     rope = SteppedRope(places, points, np.zeros_like(points), physical, 0.003, level=0.0)
     held = (0, 15, 30)
     rope.hold(held)
@@ -103,10 +103,10 @@ def test_a_bend_stays_on_a_table(kept):
     tangents = np.diff(rope.points, axis=0)
     headings = np.unwrap(np.arctan2(tangents[:, 1], tangents[:, 0]))
     curvature = np.diff(headings)[8:-8].mean() / (length / count)
-    assert curvature == pytest.approx(kept, rel=0.15, abs=0.05)
+    assert curvature == pytest.approx(friction, rel=0.15, abs=0.05)
 
 
-def test_without_friction_the_rod_is_what_it_was_bit_for_bit():
+def test_no_bending_friction_is_the_plain_rod_bit_for_bit():
     rest = np.random.default_rng(0).uniform(0.02, 0.05, 12)
     points = crumpled(1, rest)
     plain, other = (Rod(rest, properties(1e-2, 500.0, 0.05, **given_), 0.004).velocities(
@@ -135,36 +135,36 @@ def rope(physical=ALL):
     return SteppedRope(PLACES, points, np.zeros_like(points), physical, 0.003)
 
 
-def test_ropes_that_take_turns_are_what_each_is_alone():
+def test_ropes_that_take_turns_do_not_affect_each_other():
     alone = [rope(), rope({**ALL, 'torsion': 0.3})]
     together = [rope(), rope({**ALL, 'torsion': 0.3})]
-    for one in alone:
+    for first in alone:
         for nodes in COURSE:
-            one.hold(nodes)
-            one.advance(wave(one.points, nodes)[0], turns=wave(one.points, nodes)[1])
+            first.hold(nodes)
+            first.advance(*wave(first.points, nodes))
     for nodes in COURSE:
-        for one in together:
-            one.hold(nodes)
-            targets, turns = wave(one.points, nodes)
+        for second in together:
+            second.hold(nodes)
+            targets, turns = wave(second.points, nodes)
             for k in range(60):
-                one.advance(targets[k:k + 1], turns=turns[k:k + 1])
-    for one, other in zip(alone, together, strict=True):
-        assert np.isfinite(one.points).all()
-        assert one.points.tobytes() == other.points.tobytes()
+                second.advance(targets[k:k + 1], turns=turns[k:k + 1])
+    for first, second in zip(alone, together, strict=True):
+        assert np.isfinite(first.points).all()
+        assert first.points.tobytes() == second.points.tobytes()
 
 
 def test_bullet_and_the_compiled_engine_take_the_same_steps():
     client = pybullet.connect(pybullet.DIRECT)
     pybullet.setPhysicsEngineParameter(fixedTimeStep=0.003, physicsClientId=client)
     pybullet.setGravity(0, 0, -9.81, physicsClientId=client)
-    one = rope()
-    other = BulletRope(client, PLACES, one.points, ALL)
+    compiled = rope()
+    bullet = BulletRope(client, PLACES, compiled.points, ALL)
     for nodes in COURSE:
-        one.hold(nodes)
-        other.hold(nodes)
-        targets, turns = wave(one.points, nodes)
-        one.advance(targets, turns=turns)
+        compiled.hold(nodes)
+        bullet.hold(nodes)
+        targets, turns = wave(compiled.points, nodes)
+        compiled.advance(targets, turns)
         for target, turn in zip(targets, turns, strict=True):
-            other.step(target, turn)
-        assert other.points == pytest.approx(one.points, abs=1e-9)
+            bullet.step(target, turn)
+        assert bullet.points == pytest.approx(compiled.points, abs=1e-9)
     pybullet.disconnect(physicsClientId=client)

@@ -83,16 +83,16 @@ def test_forces_of_the_material_frame_are_the_slope_of_its_least_energy(seed, wi
     rod.hold(held)
     rod.frame_forces(points)
     rod.turned(points, {8: generator.normal(0, 2, 3)} if len(held) > 2 else {})
-    got = rod.frame_forces(points, 100)
+    forces = rod.frame_forces(points, 100)
     state = rod.state
-    assert got == pytest.approx(frame_forces(points, state), abs=1e-9 * np.abs(got).max())
+    assert forces == pytest.approx(frame_forces(points, state), abs=1e-9 * np.abs(forces).max())
     for index in np.ndindex(points.shape):
         if index[0] not in held:
             moved = np.zeros_like(points)
             moved[index] = 1e-6
             expected = (least_energy(points - moved, state, state.clamps)[0]
                         - least_energy(points + moved, state, state.clamps)[0]) / 2e-6
-            assert got[index] == pytest.approx(expected, abs=1e-5 * np.abs(got).max())
+            assert forces[index] == pytest.approx(expected, abs=1e-5 * np.abs(forces).max())
 
 
 @drawing(10, derandomize=True)

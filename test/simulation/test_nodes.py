@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Where the nodes lie, how observed points follow from them, and the height at which a DLO rests."""
+"""The places of the nodes, the observed points that they give, and the height at which a DLO rests."""
 
 from dataclasses import replace
 
@@ -37,7 +37,7 @@ def test_places_contain_the_fixed_ones_and_are_as_even_as_these_allow(widths, mo
     assert len(places) == count
     assert (np.diff(places) > 0).all()
     assert np.isin(fixed, places).all()
-    # Pieces that are all narrower than the widest one would be more than there are.
+    # More pieces would be needed if all were narrower than the widest one.
     widest = np.diff(places).max()
     fewest = sum(max(1, int(np.ceil(width / (0.999 * widest) - 1e-9))) for width in widths)
     assert fewest > count - 1
@@ -58,10 +58,10 @@ def test_every_gripped_point_has_a_node_of_its_own(grips, count):
 @drawing(30)
 @given(st.integers(0, 18), st.integers(12, 80))
 def test_a_clamp_that_holds_from_the_start_has_no_node_within(first, count):
-    one = trial(arc(), ((first, first + 1),))
-    a, b = NodeLayout.of(one, count).nodes(one.hands[0])
+    gripped = trial(arc(), ((first, first + 1),))
+    a, b = NodeLayout.of(gripped, count).nodes(gripped.hands[0])
     assert b == a + 1
-    free = np.delete(np.diff(NodeLayout.of(one, count).places), a)
+    free = np.delete(np.diff(NodeLayout.of(gripped, count).places), a)
     assert free.max() < 2.1 * free.min() + 1e-9 or count < 20
 
 
@@ -71,11 +71,11 @@ def test_a_grip_between_points_has_a_node_there():
                  for k, (point, offset) in enumerate(places)]
         return Trial('t', Chain(arc()), (Action(hands),), (Goal(Chain(arc()), 2.0),))
 
-    one = gripping((4, 0.4), (13, -0.3))
-    layout = NodeLayout.of(one, 30)
+    gripped = gripping((4, 0.4), (13, -0.3))
+    layout = NodeLayout.of(gripped, 30)
     along = Chain(arc()).arc_lengths()
     expected = [along[4] + 0.4 * (along[5] - along[4]), along[13] - 0.3 * (along[13] - along[12])]
-    nodes = [node for hand in one.hands for node in layout.nodes(hand)]
+    nodes = [node for hand in gripped.hands for node in layout.nodes(hand)]
     assert layout.places[nodes] == pytest.approx(expected, abs=1e-12)
     assert layout.points[nodes] == pytest.approx(Chain(arc()).resample(expected), abs=1e-9)
     near = gripping((4, 0.4), (4, 0.41), (20, -0.02))  # gripped anew, and at the end
@@ -87,17 +87,17 @@ def test_a_grip_between_points_has_a_node_there():
 
 
 def test_points_between_those_that_a_hand_grips_keep_their_nodes():
-    one = trial(arc(), ((2, 6),))
-    a, b = NodeLayout.of(one, 61).nodes(one.hands[0])
+    gripped = trial(arc(), ((2, 6),))
+    a, b = NodeLayout.of(gripped, 61).nodes(gripped.hands[0])
     assert b > a + 4
 
 
-def test_a_piece_that_is_clamped_later_bends_until_then():
+def test_a_piece_that_is_clamped_later_has_nodes_inside():
     later = Hand('late', (10, 11), [0.5, 1.0], np.zeros((2, 3)))
-    one = Trial('t', Chain(arc()), (Action((later,)),), (Goal(Chain(arc()), 2.0),))
-    assert NodeLayout.of(one, 81).places == pytest.approx(spread_places(NodeLayout.of(one, 81).point_places[
-        [0, 10, 11, 20]], 81))
-    a, b = NodeLayout.of(one, 81).nodes(later)
+    gripped = Trial('t', Chain(arc()), (Action((later,)),), (Goal(Chain(arc()), 2.0),))
+    layout = NodeLayout.of(gripped, 81)
+    assert layout.places == pytest.approx(spread_places(layout.point_places[[0, 10, 11, 20]], 81))
+    a, b = layout.nodes(later)
     assert b > a + 1
 
 
@@ -169,7 +169,7 @@ def test_a_moving_chain_shows_no_level_at_its_start():
     assert resting_level(moving, 0.0) is None
 
 
-def test_points_that_rest_are_put_on_the_level_and_others_are_left():
+def test_points_that_rest_are_moved_to_the_level_and_others_are_not():
     points = arc(height=0.008)
     points[:, 2] += np.linspace(-0.004, 0.05, 21)
     rested = rest_on(points, 0.008)
@@ -196,7 +196,7 @@ def test_a_strand_that_lies_on_another_keeps_its_height(diameter, first_above):
     np.testing.assert_array_equal(rest_on(points, diameter / 2)[:, 2], diameter / 2)
 
 
-def test_what_is_annotated_as_feature_belongs_to_the_nodes_beside_it():
+def test_a_feature_is_divided_between_the_nodes_beside_it():
     points = np.stack([np.linspace(0, 1, 11), np.zeros(11), np.zeros(11)], axis=1)
     marked = Chain(points, features=np.isin(np.arange(11), (0, 3, 10)))
     shares = feature_shares(marked, np.linspace(0, 1, 5))
@@ -205,18 +205,18 @@ def test_what_is_annotated_as_feature_belongs_to_the_nodes_beside_it():
     assert not feature_shares(Chain(points), np.linspace(0, 1, 5)).any()
 
 
-def test_rest_lengths_of_the_trial_count_and_the_nodes_begin_on_the_observed_curve():
+def test_nodes_have_the_rest_lengths_of_the_trial_and_start_on_the_observed_curve():
     stretched = np.linspace(0, 1, 21)**1.2
-    one = replace(trial(arc(), ((0, 1),)), places=stretched)
-    layout = NodeLayout.of(one, 41)
+    gripped = replace(trial(arc(), ((0, 1),)), places=stretched)
+    layout = NodeLayout.of(gripped, 41)
     assert layout.places[-1] == 1
     assert layout.point_places == pytest.approx(stretched)
-    assert layout.places[list(layout.nodes(one.hands[0]))] == pytest.approx(stretched[:2])
+    assert layout.places[list(layout.nodes(gripped.hands[0]))] == pytest.approx(stretched[:2])
     assert layout.points[[0, 1, -1]] == pytest.approx(arc()[[0, 1, -1]], abs=1e-9)
     radius = np.linalg.norm(layout.points - (0, 0.4, 0), axis=1)
     assert radius == pytest.approx(np.full(41, 0.4), abs=2e-5)
     assert layout.observe @ layout.points == pytest.approx(arc(), abs=1e-3)
-    marked = replace(one, initial=replace(one.initial, features=np.arange(21) == 20))
+    marked = replace(gripped, initial=replace(gripped.initial, features=np.arange(21) == 20))
     assert NodeLayout.of(marked, 41).features[-1] == 1
 
 
@@ -231,14 +231,14 @@ def clamped(noise, markers, seed=0):
     hands = [Hand(name, grips, [0.0, 9.0], np.zeros((2, 3)))
              for name, grips in (('left', (0, 1)), ('right', (markers - 2, markers - 1)))]
     return Trial('clamped', Chain(points[0]), (Action(hands),),
-                 [Goal(Chain(one), k / 30, False, ('left', 'right')) for k, one in enumerate(points[1:], 1)])
+                 [Goal(Chain(row), k / 30, False, ('left', 'right')) for k, row in enumerate(points[1:], 1)])
 
 
 def test_clamps_that_a_stream_shows_are_held_where_they_were_measured():
-    one = clamped(3e-5, 12)
-    layout = NodeLayout.of(one, 41)
-    for hand in one.hands:
-        measured = one.initial.points[list(hand.grips)]
+    gripped = clamped(3e-5, 12)
+    layout = NodeLayout.of(gripped, 41)
+    for hand in gripped.hands:
+        measured = gripped.initial.points[list(hand.grips)]
         assert layout.points[list(layout.nodes(hand))] == pytest.approx(measured, abs=2e-5)
 
 
@@ -246,8 +246,8 @@ def test_smoothing_makes_the_direction_of_a_noisy_clamp_truer():
     exact = clamped(0.0, 41).initial.points
     measured, used = [], []
     for seed in range(20):
-        one = clamped(1e-3, 41, seed)
-        layout = NodeLayout.of(one, 61)
-        measured.append(one.initial.points[1] - one.initial.points[0] - exact[1] + exact[0])
-        used.append(layout.points[layout.nodes(one.hands[0])[1]] - layout.points[0] - exact[1] + exact[0])
+        gripped = clamped(1e-3, 41, seed)
+        layout = NodeLayout.of(gripped, 61)
+        measured.append(gripped.initial.points[1] - gripped.initial.points[0] - exact[1] + exact[0])
+        used.append(layout.points[layout.nodes(gripped.hands[0])[1]] - layout.points[0] - exact[1] + exact[0])
     assert np.linalg.norm(used) < 0.7 * np.linalg.norm(measured)

@@ -42,11 +42,11 @@ def test_a_coiled_cantilever_hangs_like_the_elastica(torsion, curvature):
     points[2:, 2] += 0.5 * curvature * (points[2:, 0] - 0.01)**2
     points = settled(rod, points, GRAVITY)
     along = np.linspace(0, 0.4, 41)
-    found = solve_bvp(
+    elastica = solve_bvp(
         lambda s, y: np.array([y[1], load * (0.4 - s) * np.cos(y[0]), np.cos(y[0]), np.sin(y[0])]),
         lambda a, b: np.array([a[0], b[1] - curvature, a[2], a[3]]), along, np.zeros((4, 41)))
-    assert found.success
-    x, z = found.sol(along)[2:]
+    assert elastica.success
+    x, z = elastica.sol(along)[2:]
     assert points[1:] == pytest.approx(np.stack([0.01 + x, 0 * x, z], axis=1), abs=0.002)
 
 
@@ -99,9 +99,9 @@ def test_free_ends_and_pins_bear_no_torque():
         state = rod.state
         moments = state.twisting * np.diff(state.angles)
         bends, cosine, sine = state.joints[:, :2], state.joints[:, 4], state.joints[:, 5]
-        one, two = (state.natural[:, 0] * cosine - state.natural[:, 1] * sine,
-                    state.natural[:, 0] * sine + state.natural[:, 1] * cosine)
-        slopes = (bends[:, 0] * two - bends[:, 1] * one) / 2
+        x, y = (state.natural[:, 0] * cosine - state.natural[:, 1] * sine,
+                state.natural[:, 0] * sine + state.natural[:, 1] * cosine)
+        slopes = (bends[:, 0] * y - bends[:, 1] * x) / 2
         torques = np.concatenate([moments - slopes, [0.0]]) - np.concatenate([[0.0], moments + slopes])
         assert np.abs(torques[1 if 1 in held else 0:]).max() < 2e-3 * np.abs(moments).max()
 

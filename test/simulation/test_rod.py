@@ -52,16 +52,16 @@ def test_forces_are_the_slope_of_the_energy(seed, equal):
     rest = np.full(7, 0.05) if equal else generator.uniform(0.02, 0.08, 7)
     points = crumpled(seed, rest)
     step = 1e-8
-    got = forces(Rod(rest, CABLE, step), points, step)
+    simulated = forces(Rod(rest, CABLE, step), points, step)
     expected = np.zeros_like(points)
     for index in np.ndindex(points.shape):
         moved = np.zeros_like(points)
         moved[index] = 1e-6
         expected[index] = -(energy(points + moved, rest, CABLE) - energy(points - moved, rest, CABLE)) / 2e-6
-    assert got == pytest.approx(expected, abs=1e-5 * np.abs(expected).max())
+    assert simulated == pytest.approx(expected, abs=1e-5 * np.abs(expected).max())
 
 
-def test_a_straight_rod_of_its_own_length_is_without_force():
+def test_a_straight_rod_of_its_rest_length_has_no_force():
     rest = np.array([0.03, 0.05, 0.02, 0.06])
     turned = straight(rest) @ np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
     velocities = Rod(rest, CABLE, 0.004).velocities(turned + 3, np.zeros_like(turned), NONE, FREE)
@@ -182,10 +182,10 @@ def test_a_cantilever_of_parts_bends_like_its_parts_in_series(profile, count):
 
 
 def test_equal_parts_are_one_rod_bit_for_bit():
-    rest, one = np.full(12, 0.03), properties(1e-2, 500.0, 0.05)
+    rest, plain = np.full(12, 0.03), properties(1e-2, 500.0, 0.05)
     parts = properties(1e-2, 500.0, 0.05, profile=(1.0,) * 6)
     points = crumpled(4, rest)
-    assert Rod(rest, one, 0.004).velocities(points, points, GRAVITY, FREE).tobytes() == Rod(
+    assert Rod(rest, plain, 0.004).velocities(points, points, GRAVITY, FREE).tobytes() == Rod(
         rest, parts, 0.004).velocities(points, points, GRAVITY, FREE).tobytes()
 
 
@@ -219,20 +219,20 @@ def test_held_nodes_follow_their_velocities():
     rest = np.full(10, 0.05)
     rod = Rod(rest, CABLE, 0.004)
     rod.hold((7, 2))
-    given_ones = np.array([[0.1, 0, 0], [0, -0.2, 0.3]])
-    velocities = rod.velocities(crumpled(0, rest), np.zeros((11, 3)), GRAVITY, given_ones)
-    assert velocities[[7, 2]] == pytest.approx(given_ones)
+    given_velocities = np.array([[0.1, 0, 0], [0, -0.2, 0.3]])
+    velocities = rod.velocities(crumpled(0, rest), np.zeros((11, 3)), GRAVITY, given_velocities)
+    assert velocities[[7, 2]] == pytest.approx(given_velocities)
     rod.hold(())
     assert rod.velocities(straight(rest), np.zeros((11, 3)), GRAVITY, FREE) == pytest.approx(
         np.tile(0.004 * GRAVITY, (11, 1)))
 
 
 @pytest.mark.parametrize('bad', [np.nan, np.inf])
-def test_what_is_not_finite_is_refused_at_the_start_and_diverges_later(bad):
+def test_points_that_are_not_finite_are_refused_at_the_start_and_diverge_later(bad):
     rest = np.full(4, 0.05)
     points = straight(rest)
     points[2, 1] = bad
-    with pytest.raises(ValueError, match='points: got a number that is not finite'):
+    with pytest.raises(ValueError, match='points: a number that is not finite; expected finite ones'):
         core.Start(points[:, 0], points, np.zeros_like(points))
     start = core.Start(points[:, 0], straight(rest), np.zeros_like(points))
     rope = core.Rope(start, ParameterSpace().physical({}, 0.2), 0.004, -1e6, GRAVITY)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The course of a trial on an engine that is easy to predict: free nodes sink, held ones follow."""
+"""Scripts on an engine that is easy to predict: free nodes sink, held nodes follow."""
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -32,7 +32,7 @@ class Sinking(Engine):
         self._left = round(until / STEP) if np.isfinite(until) else np.inf
 
     def simulate(self, trial, physical):
-        known, start, _ = self._prepare(trial, physical)
+        prepared, start, _ = self._prepare(trial, physical)
         rope = core.Rope(start, physical, STEP, 0.0, np.zeros(3))
 
         def step():
@@ -44,7 +44,7 @@ class Sinking(Engine):
             self._left -= 1
             rope.points[rope.held] = rope.targets
 
-        return self._rollout(known, rope.follow(known.script.events, step))
+        return self._rollout(prepared, rope.follow(prepared.script.events, step))
 
 
 def rolled(hands, goals, until=np.inf, settling=None, nodes=11):
@@ -77,7 +77,7 @@ def test_a_hand_holds_from_its_first_waypoint_to_its_last():
     # It sinks until the hand closes, follows, and sinks again.
     assert chains[:, 4, 2] == pytest.approx(-SPEED * np.array([0.3, 0.5, 0.5, 0.5, 0.75, 1.0]), abs=1e-9)
     assert chains[:, 4, 1] == pytest.approx([0, 0, 0.1, 0.2, 0.2, 0.2], abs=1e-9)
-    # A free one sinks all the time, the other hand's does not move.
+    # A free node sinks all the time, the node of the other hand does not move.
     assert chains[:, 8, 2] == pytest.approx(-SPEED * np.array([0.3, 0.5, 1.0, 1.5, 1.75, 2.0]), abs=1e-9)
     assert chains[:, 0] == pytest.approx(np.zeros((6, 3)), abs=1e-9)
 
@@ -137,15 +137,15 @@ def test_a_stable_goal_waits_until_all_is_at_rest(goal):
 
 
 def test_a_stream_of_stable_goals_waits_once():
-    one = rolled([hand(2, 0.0, 1.0)], [resting(1.5)], until=3.0)
+    single = rolled([hand(2, 0.0, 1.0)], [resting(1.5)], until=3.0)
     many = rolled([hand(2, 0.0, 1.0)], [resting(1.5 + k / 30) for k in range(20)], until=3.0)
-    assert many.steps == one.steps
+    assert many.steps == single.steps
     assert all(many.settled)
     for chain in many.chains:
-        assert chain == pytest.approx(one.chains[0], abs=0)
+        assert chain == pytest.approx(single.chains[0], abs=0)
 
 
-def test_times_in_which_nothing_happens_are_skipped():
+def test_time_at_rest_is_skipped():
     late = hand(4, 300.0, 301.0, (0, 0.2, 0))
     rollout = rolled([late], [resting(900.0)], until=1.0)
     assert rollout.settled == (True,)
@@ -166,7 +166,7 @@ def test_no_time_is_skipped_before_a_timed_goal():
     assert resting_until.chains[:, 5, 2] == pytest.approx([-SPEED * 5, -SPEED * 6], abs=1e-9)
 
 
-def test_what_never_settles_says_so_and_is_given_up():
+def test_a_dlo_that_never_settles_is_reported_after_the_limit():
     rollout = rolled([hand(0, 0.0, 1.0)], [resting(1.5)], settling=Settling(0.001, 0.25, 3.0))
     assert rollout.settled == (False,)
     assert rollout.duration == pytest.approx(1.5 + 3.0, abs=2 * STEP)

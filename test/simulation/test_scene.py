@@ -39,8 +39,8 @@ def test_shapes_stand_where_links_and_origins_put_them(scene):
 
 def test_friction_is_one_unless_the_link_says_another(scene):
     other = '<contact><lateral_friction value="0.25"/></contact>'
-    found = scene(f'<link name="a">{BOX}</link><link name="b">{other}{BOX}{BOX}</link>')
-    assert [obstacle.friction for obstacle in found] == [1.0, 0.25, 0.25]
+    obstacles = scene(f'<link name="a">{BOX}</link><link name="b">{other}{BOX}{BOX}</link>')
+    assert [obstacle.friction for obstacle in obstacles] == [1.0, 0.25, 0.25]
 
 
 MESH = '<link name="a"><collision><geometry><mesh filename="{}"/></geometry></collision></link>'
@@ -197,7 +197,7 @@ SHAPE = '<link name="a"><collision><geometry>{}</geometry></collision></link>'
     (f'<link name="a">{BOX}</link>{B}' + JOINT.format('a', 'b') + JOINT.format('b', 'a'), 'loop'),
     (f'<link name="a">{BOX}</link>{B}' + 2 * JOINT.format('a', 'b'), "the joint 'ab'"),
 ])
-def test_what_cannot_be_used_is_refused_with_its_place(scene, inside, came):
+def test_an_unusable_element_is_refused_with_its_place(scene, inside, came):
     with pytest.raises(InputError) as refusal:
         scene(inside)
     assert 'peg.urdf: ' in str(refusal.value)

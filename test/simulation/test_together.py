@@ -33,16 +33,16 @@ def drawn(names, count, seed=7, low=0.1, high=0.9):
 
 
 def same(simulator, jobs):
-    """Tell of each job whether it is the same alone and together with the others."""
+    """Yield for each job whether its rollout is the same alone and together with the others."""
     together = simulate_all(simulator, jobs, Stop())
     assert len(together) == len(jobs)
-    for (trial, physical), got in zip(jobs, together, strict=True):
+    for (trial, physical), rollout in zip(jobs, together, strict=True):
         try:
             expected = simulator.simulate(trial, physical)
         except SimulationError as error:
-            yield str(error) == str(got)
+            yield str(error) == str(rollout)
         else:
-            yield (got.chains.tobytes(), got.settled, got.steps, got.duration) == (
+            yield (rollout.chains.tobytes(), rollout.settled, rollout.steps, rollout.duration) == (
                 expected.chains.tobytes(), expected.settled, expected.steps, expected.duration)
 
 
@@ -75,7 +75,8 @@ def test_dlos_that_resist_twist_or_rub_beside_some_that_do_not():
     sets = [{**physical, **changes} for physical in drawn(CABLES, 2) for changes in (
         {}, {'torsion': 0.0}, {'bending_friction': 0.0}, {'natural_curvature': 0.0},
         {'torsion': 0.0, 'natural_curvature': 0.0})]
-    assert all(same(simulator, [(trial, one) for one in sets for trial in (carried(0.1, 0.2), turned(1.0))]))
+    trials = carried(0.1, 0.2), turned(1.0)
+    assert all(same(simulator, [(trial, physical) for physical in sets for trial in trials]))
 
 
 def test_a_dlo_that_touches_itself_beside_one_that_does_not():
@@ -91,40 +92,43 @@ def test_a_dlo_that_touches_itself_beside_one_that_does_not():
         for trial in (tightened, pulled)]))
 
 
-def test_one_that_diverges_does_not_disturb_the_others():
+def test_a_diverging_rollout_does_not_affect_the_others():
     simulator = CompiledSimulator(table=False, nodes=21)
     good, = drawn(CABLES, 1)
     jobs = [(carried(0.1, 0.2), {**good, **changes}) for changes in (
         {}, {'flexibility': float('nan')}, {'damping': 2.0}, {'elasticity': float('nan')}, {'damping': 3.0})]
     together = simulate_all(simulator, jobs, Stop())
-    assert [isinstance(one, SimulationError) for one in together] == [False, True, False, True, False]
+    assert [isinstance(outcome, SimulationError) for outcome in together] == [False, True, False, True, False]
     assert all(same(simulator, jobs))
 
 
-def test_what_was_simulated_before_makes_no_difference():
+def test_earlier_rollouts_make_no_difference():
     used = CompiledSimulator(table=False, nodes=21)
     trials = [carried(0.1, 0.2), replace(turned(1.0), places=np.linspace(0, 0.6, 21))]
     sets = [{}, {'elasticity': float('nan')}, {'torsion': 0.0, 'natural_curvature': 0.0},
             {'self_collision': 0.012, 'stiffness_2': 3.0}]
-    jobs = [(trial, {**physical, **one}) for physical in drawn(CABLES, 2) for trial in trials for one in sets]
+    jobs = [(trial, {**physical, **changes}) for physical in drawn(CABLES, 2) for trial in trials
+            for changes in sets]
     for _ in range(2):
-        for job, found in zip(jobs, simulate_all(used, jobs, Stop()), strict=True):
-            new = simulate_all(CompiledSimulator(table=False, nodes=21), [job], Stop())
-            assert [str(one) for one in new] == [str(found)] if isinstance(found, SimulationError) else (
-                new[0].chains.tobytes() == found.chains.tobytes())
+        for job, outcome in zip(jobs, simulate_all(used, jobs, Stop()), strict=True):
+            new, = simulate_all(CompiledSimulator(table=False, nodes=21), [job], Stop())
+            if isinstance(outcome, SimulationError):
+                assert str(new) == str(outcome)
+            else:
+                assert new.chains.tobytes() == outcome.chains.tobytes()
         jobs.reverse()
 
 
 @pytest.mark.parametrize('rows', [0, 500])
-def test_scripts_that_are_too_long_to_keep_are_written_again(rows, monkeypatch):
+def test_scripts_that_are_too_long_for_the_cache_are_written_again(rows, monkeypatch):
     jobs = [(trial, physical) for physical in drawn(CABLES, 2) for trial in (carried(0.1, 0.2), turned(1.0))]
     expected = simulate_all(CompiledSimulator(table=False, nodes=21), jobs, Stop())
     monkeypatch.setattr('dlo_calibration.simulation.compiled.MOST_POSITIONS', rows)
-    found = simulate_all(CompiledSimulator(table=False, nodes=21), jobs, Stop())
-    assert [one.chains.tobytes() for one in found] == [one.chains.tobytes() for one in expected]
+    rollouts = simulate_all(CompiledSimulator(table=False, nodes=21), jobs, Stop())
+    assert [one.chains.tobytes() for one in rollouts] == [one.chains.tobytes() for one in expected]
 
 
-def test_whoever_asks_can_end_it():
+def test_a_stop_flag_ends_the_call():
     jobs = [(carried(0.1, 0.2), physical) for physical in drawn(CABLES, 8)]
     compiled, stop, begun = CompiledSimulator(table=False, nodes=21), Stop(), []
 

@@ -68,7 +68,7 @@ def test_a_clamp_that_turns_about_its_axis_twists_the_dlo_by_that_angle(turn):
     assert moments(rod, points) == pytest.approx(np.full(11, 0.7 * 1e-2 * turn / 0.5))
 
 
-def test_what_stays_between_the_same_clamps_stays_twisted():
+def test_the_part_between_the_same_clamps_stays_twisted():
     points = straight(np.full(12, 0.05))
     rod = held(points)
     rod.turned(points, {11: (1.5, 0, 0)})

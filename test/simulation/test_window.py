@@ -42,8 +42,8 @@ def world(monkeypatch):
 
 
 def places(client, bodies):
-    return np.array([pybullet.getBasePositionAndOrientation(one, physicsClientId=client)[0]
-                     for one in bodies])
+    return np.array([pybullet.getBasePositionAndOrientation(body, physicsClientId=client)[0]
+                     for body in bodies])
 
 
 def test_a_film_has_beads_that_touch_and_hands_that_open(film):
@@ -83,6 +83,6 @@ def test_films_of_different_dlos_share_the_stage(film, world):
     assert places(world.client, stage._hands)[0, 2] < -100
 
 
-def test_it_stops_when_the_command_ends(film, world):
+def test_a_film_stops_when_the_command_ends(film, world):
     stage = window._Stage(world.client, [film], 0.004, 0.0)
     assert not stage.show(film, lambda: 0.0, lambda _: None, lambda: True)

@@ -157,7 +157,7 @@ def _of_session(folder: Path, err: str) -> list[str]:
     lost += [f'{name} is missing, and not named: {last}' for name in FIT
              if name != 'session.mcap' and name not in last and not (folder / name).exists()]
     try:
-        whole = not read_session(folder).problems
+        whole = not read_session(folder).warnings
     except DloCalibrationError as error:  # it has no input message yet
         whole = 'expected at least one of initial_chain' not in str(error)
     if not whole and 'messages from' not in last:

@@ -26,6 +26,7 @@ from toy_simulator import new_toy, ToySimulator
 from without_drawings import leave_out_drawings, leave_out_slices
 from wrong_input import mutated, serialised
 
+from dlo_calibration.calibration.options import FileOptions
 from dlo_calibration.cli.main import main
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.record import decode, encode, Record, typestore
@@ -108,7 +109,7 @@ def good_files(folder: Path) -> tuple[list[tuple[Path, int]], Path, Path]:
     code, _, error = verb('fit', ours, '--json', '--output', folder / 'out')
     assert code == 0, error
     request = folder / 'request.xml'
-    write_request(request, Request(tuple(map(TrialRequest.of, toy_trials(2))), QUICK))
+    write_request(request, Request(tuple(map(TrialRequest.of, toy_trials(2))), FileOptions(QUICK)))
     return files, folder / 'out' / 'result.xml', request
 
 

@@ -30,7 +30,7 @@ def browser():
 
 
 class Tab:
-    """A window with the capture page, and what it complained about."""
+    """A window with the capture page, and the errors that it reported."""
 
     def __init__(self, browser, address, size=DESKTOP, **how):
         self.context = browser.new_context(viewport={'width': size[0], 'height': size[1]}, **how)
@@ -38,7 +38,8 @@ class Tab:
         self.page = self.context.new_page()
         self.complaints = []
         self.page.on('pageerror', lambda error: self.complaints.append(str(error)))
-        self.page.on('console', lambda one: one.type == 'error' and self.complaints.append(one.text))
+        self.page.on('console', lambda message: message.type == 'error'
+                     and self.complaints.append(message.text))
         self.page.goto(address)
         self.find('#title').wait_for()
 
@@ -100,10 +101,10 @@ class Tab:
             self.page.keyboard.press(key)
 
     def violations(self):
-        """Return what axe finds on the page as it is; each with the first place."""
+        """Return the violations that axe reports of the page, each with its first place."""
         axe = pytest.importorskip('axe_playwright_python.sync_playwright', reason='no axe is installed')
-        found = axe.Axe().run(self.page).response['violations']
-        return [f'{one["id"]}: {one["nodes"][0]["html"][:200]}' for one in found]
+        violations = axe.Axe().run(self.page).response['violations']
+        return [f'{violation["id"]}: {violation["nodes"][0]["html"][:200]}' for violation in violations]
 
     def overflow(self):
         """Return by how many pixels the page or its panel would have to be scrolled sideways."""

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The server of the capture page: started in this process with the toy, or apart; a client; photographs."""
+"""The server of the capture page, in this process with the toy or in another one; a client; photographs."""
 
 import argparse
 from contextlib import contextmanager
@@ -40,7 +40,7 @@ def table(pixel):
     return [(pixel[0] - 10.0) / PER_METRE, (290.0 - pixel[1]) / PER_METRE]
 
 
-SCALE = {'kind': 'points', 'points': [{'pixel': list(one), 'table': table(one)} for one in CORNERS]}
+SCALE = {'kind': 'points', 'points': [{'pixel': list(corner), 'table': table(corner)} for corner in CORNERS]}
 
 
 def drawn(line, suffix='.png'):
@@ -108,14 +108,14 @@ class Page:
         """Let `edit` change the document; return the state."""
         state = self.state()
         edit(state['document'])
-        return self.done('PUT', 'api/document', {one: state[one] for one in ('revision', 'document')})
+        return self.done('PUT', 'api/document', {key: state[key] for key in ('revision', 'document')})
 
     def add(self, octets, name='photograph.png'):
         """Add a photograph; return its id."""
         return self.done('POST', 'api/photographs', octets, {'X-Name': urllib.parse.quote(name)})['id']
 
     def until(self, ready, what='it'):
-        """Wait until the state is so; return it."""
+        """Wait until `ready` accepts the state; return it."""
         begun = time.monotonic()
         while not ready(state := self.state()):
             assert time.monotonic() - begun < PATIENCE, f'{what} never came: {state["calibration"]}'
@@ -124,10 +124,10 @@ class Page:
 
 
 def described(document):
-    """Say all about two photographs of a trial."""
+    """Enter scale, clicks and hands for two photographs of a trial."""
     document['dlo']['diameter'] = DIAMETER
-    for one, line in zip(document['photographs'], (START, GOAL), strict=True):
-        one.update(scale=SCALE, clicks=clicks(line))
+    for photograph, line in zip(document['photographs'], (START, GOAL), strict=True):
+        photograph.update(scale=SCALE, clicks=clicks(line))
     document['trials'][0]['steps'] = [{'kind': 'drag', 'fraction': 1.0}]
 
 
@@ -159,8 +159,8 @@ class ToyInformation:
         return not self.alive
 
     def waiting_information(self):
-        found, self.waiting = self.waiting, []
-        yield from found
+        reported, self.waiting = self.waiting, []
+        yield from reported
 
 
 @contextmanager
@@ -198,11 +198,11 @@ def served(folder, *words, simulator=ToySimulator, appraising=False):
 
 
 @contextmanager
-def apart(folder, *words):
-    """Give the page of a folder, and the process that serves it with the toy."""
+def page_process(folder, *words, program=(toy_command.__file__, '0.01')):
+    """Give the page of a folder, and the process that serves it; by default, with the toy."""
     process = subprocess.Popen(
-        [sys.executable, toy_command.__file__, '0.01', 'capture', str(folder), '--no-browser',
-         '--workers', '1', *map(str, words)], env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)},
+        [sys.executable, *program, 'capture', str(folder), '--no-browser', '--workers', '1',
+         *map(str, words)], env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)},
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         line = process.stdout.readline()

@@ -8,7 +8,7 @@ import math
 import cv2
 import numpy as np
 
-from dlo_calibration.vision.camera import Lens
+from dlo_calibration.vision.lens import Lens
 from dlo_calibration.vision.scale import Scale
 from dlo_calibration.vision.tracer import Crossing, Trace
 
@@ -44,17 +44,17 @@ def traced(points, scale, crossings=(), diameter=DIAMETER, spacing=2.0):
     at = np.linspace(0.0, along[-1], round(along[-1] / spacing))
     even = np.stack([np.interp(at, along, axis) for axis in pixels.T], axis=1)
     lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    found = []
+    crossed = []
     for pair in crossings:
         first, second = np.interp(np.array(pair) * lengths[-1], lengths, along)
         pixel = tuple(float(np.interp(first, along, axis)) for axis in pixels.T)
-        found.append(Crossing(pixel, float(first), float(second), None))
-    ahead = np.gradient(points, axis=0)
-    aside = np.cross(ahead, scale.camera - points)
+        crossed.append(Crossing(pixel, float(first), float(second), None))
+    tangents = np.gradient(points, axis=0)
+    aside = np.cross(tangents, scale.camera - points)
     aside *= diameter / 2 / np.linalg.norm(aside, axis=1, keepdims=True)
     edges = scale.to_pixels(points + aside) - scale.to_pixels(points - aside)
     width = float(np.median(np.linalg.norm(edges, axis=1)))
-    return Trace(even, np.ones(len(even), bool), width, tuple(found))
+    return Trace(even, np.ones(len(even), bool), width, tuple(crossed))
 
 
 def curve(bend=0.8, angle=0.2, length=0.5, count=400, height=DIAMETER / 2):
@@ -91,8 +91,9 @@ def drawn(points, scale, diameter=DIAMETER, seed=1):
     """Return a photograph (h, w, 3) of a dark DLO with an even colour on a bright table."""
     trace = traced(points, scale, diameter=diameter)
     picture = np.full((SIZE[1], SIZE[0], 3), 205, np.uint8)
-    ahead = np.gradient(trace.pixels, axis=0)
-    aside = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1) / np.linalg.norm(ahead, axis=1, keepdims=True)
+    tangents = np.gradient(trace.pixels, axis=0)
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    aside = np.stack([-tangents[:, 1], tangents[:, 0]], axis=1)
     edges = [trace.pixels + side * trace.width / 2 * aside for side in (-1, 1)]
     outline = np.rint(np.concatenate([edges[0], edges[1][::-1]]) * 16).astype(np.int32)
     cv2.fillPoly(picture, [outline], (40, 50, 120), cv2.LINE_AA, 4)

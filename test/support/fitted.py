@@ -14,6 +14,6 @@ from dlo_calibration.search import Hints
 
 def fitted(trials, space, simulator, search, *, budget=150, seed=1, **rest):
     """Return the result of a search that knows no prior; `rest` is of `Setting`."""
-    setting = Setting(tuple(trials), Options(seed=seed), simulator, **rest)
-    found = examined(setting, fit(setting, space, search, budget))
-    return CalibrationResult.of(setting, Prior(space, Hints.none(space.dimension)), found)
+    setting = Setting(tuple(trials), Options(seed=seed, evaluations=budget), simulator, **rest)
+    findings = examined(setting, fit(setting, space, search, budget))
+    return CalibrationResult.of(setting, Prior(space, Hints.none(space.dimension)), findings)

@@ -40,7 +40,7 @@ class MadeUpDlo:
         return {name: self._estimate(name, *interval) for name, interval in self.intervals.items()}
 
     def _estimate(self, name: str, value: float, lower: float, upper: float) -> ParameterEstimate:
-        physical = [self.space.reported(name, one)[0] for one in (value, lower, upper)]
+        physical = [self.space.reported(name, end)[0] for end in (value, lower, upper)]
         unit = self.space.reported(name, value)[1]
         return ParameterEstimate(name, value, (upper - lower) / 3.29, lower, upper, *physical, unit, True)
 

@@ -40,19 +40,13 @@ def rod_velocities(rod, points, velocities):
     at = (3 * rod.held[:, None] + np.arange(3)).ravel()
     matrix[at, at] += np.repeat(pull, 3)
     scale = 1 / np.sqrt(np.diag(matrix))  # what is held is 1e12 times as heavy
-    found = scale * np.linalg.solve(scale[:, None] * matrix * scale, scale * right.ravel())
-    found = found.reshape(-1, 3)
-    found[rod.held] = rod.follow
-    return found
+    solution = scale * np.linalg.solve(scale[:, None] * matrix * scale, scale * right.ravel())
+    solution = solution.reshape(-1, 3)
+    solution[rod.held] = rod.follow
+    return solution
 
 
-def _forces(torques, tangents, lengths):
-    """Return the (N, 3) [N] forces at the ends of segments that (N - 1, 3) [N m] torques on them are."""
-    couples = np.cross(torques, tangents) / lengths[:, None]
-    forces = np.zeros((len(lengths) + 1, 3))
-    forces[1:] += couples
-    forces[:-1] -= couples
-    return forces
+
 
 
 def bends_along(points, start=None):
@@ -68,13 +62,14 @@ def bends_along(points, start=None):
     first, second = tangents[:-1], tangents[1:]
     half = np.sqrt(np.maximum((1 + np.einsum('ij,ij->i', first, second)) / 2, HAIRPIN))
     frame = frame_along(tangents, start)
-    one, two = (np.einsum('ij,ij->i', second, axis[:-1]) for axis in (frame, np.cross(tangents, frame)))
-    return tangents, frame, lengths, (one + 1j * two) / half, half
+    along, across = (np.einsum('ij,ij->i', second, axis[:-1])
+                     for axis in (frame, np.cross(tangents, frame)))
+    return tangents, frame, lengths, (along + 1j * across) / half, half
 
 
 def frame_forces(points, state):
     """Return the forces of the material frame on the nodes, (N, 3) [N], at the angles that it has."""
-    tangents, frame, lengths, bends, half = bends_along(points, state.carried[1])
+    tangents, frame, lengths, bends, half = bends_along(points, state.bishop[1])
     natural = state.natural[:, 0] + 1j * state.natural[:, 1]
     if state.twisting.any():
         natural = natural * np.exp(0.5j * (state.angles[1:] + state.angles[:-1]))
@@ -108,7 +103,7 @@ def least_energy(points, state, clamps=(), near=None):
     :param clamps: pairs of a segment and a unit vector (3,) of the frame there.
     :param near: (N - 1,) [rad] angles to begin with; None: those of the state.
     """
-    _, frame, _, bends, _ = bends_along(points, state.carried[1])
+    _, frame, _, bends, _ = bends_along(points, state.bishop[1])
     tangents = np.diff(points, axis=0) / np.linalg.norm(np.diff(points, axis=0), axis=1)[:, None]
     natural = state.natural[:, 0] + 1j * state.natural[:, 1]
     if not state.twisting.any():
@@ -155,14 +150,20 @@ def _angle(first, second, tangent):
     return math.atan2(np.cross(first, second) @ tangent, first @ second)
 
 
-def kept_apart(contact, friction, points, velocities, inverse_masses, support, step):
-    """Return the (N, 3) [m/s] velocities that contacts allow; every pair that may touch is looked at."""
-    middles, half = contact['middles'], contact['half']
-    distances = contact['distances'].reshape(len(half), -1)
+def without_penetration(places, start, radius, friction, points, velocities, inverse_masses, support, step):
+    """
+    Return the (N, 3) [m/s] velocities that contacts allow, from a check of every pair that may touch.
+
+    :param places: (N,) [m] arc lengths of the nodes.
+    :param start: (N, 3) [m] points at the start, where pairs may be nearer than a diameter.
+    """
+    half = np.diff(places) / 2
+    middles = places[:-1] + half
     between = middles[None, :] - middles[:, None] - half[None, :] - half[:, None]
-    first, second = np.nonzero(between > contact['apart'])
+    first, second = np.nonzero(between > max(np.pi * radius, half.max()))
+    allowed = np.minimum(closest(start, first, second)[3], 2 * radius)
     s, t, normal, distance = closest(points, first, second)
-    gap = distance - np.maximum(distances[first, second], np.minimum(distance, contact['diameter']))
+    gap = distance - np.maximum(allowed, np.minimum(distance, 2 * radius))
     wanted = np.where(gap > 0, -gap / step, np.minimum(-PUSH_OUT * gap / step, FASTEST_PUSH_OUT))
     nodes = np.stack([first, first + 1, second, second + 1], axis=1)
     weights = np.stack([1 - s, s, -(1 - t), -t], axis=1)
@@ -216,8 +217,8 @@ def closest(points, first, second):
     t = (b * s + f) / e
     clipped = np.clip(t, 0, 1)
     s = np.where(t == clipped, s, np.clip((b * clipped - c) / a, 0, 1))
-    apart = r + s[:, None] * d1 - clipped[:, None] * d2
-    distance = np.linalg.norm(apart, axis=1)
-    upward = np.tile((0.0, 0.0, 1.0), (len(first), 1))  # any, where the axes meet
-    normal = np.where(distance[:, None] > TINY, apart / np.maximum(distance, TINY)[:, None], upward)
+    separation = r + s[:, None] * d1 - clipped[:, None] * d2
+    distance = np.linalg.norm(separation, axis=1)
+    upward = np.tile((0.0, 0.0, 1.0), (len(first), 1))  # an arbitrary normal where the axes meet
+    normal = np.where(distance[:, None] > TINY, separation / np.maximum(distance, TINY)[:, None], upward)
     return s, clipped, normal, distance

@@ -261,7 +261,7 @@ def _lay(image, sheet, places):
     u, v = u[inside], v[inside]
     side = 1024
     count = -(-len(u) // side) * side
-    u, v = (np.resize(one, count).reshape(-1, side).astype(np.float32) for one in (u, v))
+    u, v = (np.resize(coordinate, count).reshape(-1, side).astype(np.float32) for coordinate in (u, v))
     colours = [cv2.remap(picture, u[k:k + 1024], v[k:k + 1024], cv2.INTER_LINEAR,
                          borderMode=cv2.BORDER_REPLICATE) for k in range(0, len(u), 1024)]
     image[inside] = 0.85 * np.concatenate(colours).reshape(-1, 3)[:inside.sum()]
@@ -407,8 +407,8 @@ def _ray(rays, u, v):
     y, x = (y - i)[..., None], (x - j)[..., None]
     above = (1 - x) * rays[i, j] + x * rays[i, j + 1]
     below = (1 - x) * rays[i + 1, j] + x * rays[i + 1, j + 1]
-    found = (1 - y) * above + y * below
-    return found[..., 0], found[..., 1]
+    interpolated = (1 - y) * above + y * below
+    return interpolated[..., 0], interpolated[..., 1]
 
 
 def _table_map(rays, rotation, position, width, height):

@@ -8,15 +8,15 @@ from pathlib import Path
 
 def _with(place, number):
     """Return the command lines of living processes whose status has a number at a place, by id."""
-    found = {}
+    commands = {}
     for folder in Path('/proc').glob('[0-9]*'):
         try:
             fields = (folder / 'stat').read_text().rpartition(')')[2].split()
             if int(fields[place]) == number and fields[0] != 'Z':
-                found[int(folder.name)] = (folder / 'cmdline').read_bytes().replace(b'\0', b' ').decode()
+                commands[int(folder.name)] = (folder / 'cmdline').read_bytes().replace(b'\0', b' ').decode()
         except (FileNotFoundError, ProcessLookupError):  # it ended meanwhile
             pass
-    return found
+    return commands
 
 
 def children(parent):

@@ -94,14 +94,14 @@ def bends(curve, limit=0.5):
     angle = np.unwrap(np.arctan2(*np.diff(flat, axis=0).T[::-1]))
     curvature = gaussian_filter1d(np.diff(angle), 8)
     edges = [0, *np.nonzero(np.diff(np.sign(curvature)))[0], len(curvature)]
-    found = []
+    indices = []
     for first, last in zip(edges[:-1], edges[1:], strict=True):
         turned = np.abs(curvature[first:last].sum())
         # A loop is as many bends as it has quarter turns and a half.
         parts = max(1, round(turned / (0.75 * np.pi))) if turned > limit else 0
         share = np.abs(np.cumsum(curvature[first:last])) / max(turned, 1e-9)
-        found += [first + int(np.searchsorted(share, (k + 0.5) / parts)) for k in range(parts)]
-    return found
+        indices += [first + int(np.searchsorted(share, (k + 0.5) / parts)) for k in range(parts)]
+    return indices
 
 
 def clicks(generator, scene_camera, curve, off):

@@ -27,27 +27,27 @@ def rest_shape_space(knots: int = 9, mass: float = 0.05) -> ParameterSpace:
 
 def rest_shape_result(knots: int = 9, mass: float = 0.05, seed: int = 0) -> CalibrationResult:
     """Return what a toy finds, with the parameters of `rest_shape_space` and any covariance of them."""
-    found = calibrate(toy_trials(2), Options.of({'workers': 1, 'evaluations': 30}), make_simulator=new_toy)
+    result = calibrate(toy_trials(2), Options.of({'workers': 1, 'evaluations': 30}), make_simulator=new_toy)
     space, rng = rest_shape_space(knots, mass), np.random.default_rng(seed)
     fractions = np.repeat(np.linspace(0, 1, knots), 2)
     bent = 3 * np.sin(4 * fractions) + np.where(np.arange(2 * knots) % 2, 1.0, 2.0)  # 1/m
-    point = np.concatenate([found.best.point, [value / 100 for value in MEMORY.values()], 0.5 + bent / 50])
+    point = np.concatenate([result.best.point, [value / 100 for value in MEMORY.values()], 0.5 + bent / 50])
     std = np.concatenate([0.02 * rng.uniform(0.5, 6, len(point) - 2 * knots),
                           rng.uniform(0.005, 0.015, 2 * knots)])
     std[-1] = 0.12  # weak
     mixed = np.eye(len(point)) + 0.3 * rng.normal(size=(len(point), len(point)))
     covariance = mixed @ mixed.T
     covariance *= np.outer(*2 * [std / np.sqrt(np.diag(covariance))])
-    assert found.examination is not None
+    assert result.examination is not None
     uncertainty = Uncertainty(
         std=std, lower=np.clip(point - DEVIATIONS * std, 0, 1), upper=np.clip(point + DEVIATIONS * std, 0, 1),
         excited=np.ones(len(point), bool), at_bound=np.zeros(len(point), bool), covariance=covariance,
         residual=0.002, scale=0.004)
-    best = replace(found.best, point=point, values=space.values(point))
-    evaluations = tuple(replace(one, point=(one_point := np.append(one.point, point[4:])),
-                                values=space.values(one_point)) for one in found.evaluations)
+    best = replace(result.best, point=point, values=space.values(point))
+    evaluations = tuple(replace(evaluation, point=(longer := np.append(evaluation.point, point[4:])),
+                                values=space.values(longer)) for evaluation in result.evaluations)
     return replace(
-        found, space=space, best=best, evaluations=evaluations,
-        parameters=parameter_estimates(space, best, uncertainty),
-        examination=replace(found.examination, uncertainty=uncertainty, regular=True, noise=0.001,
-                            jacobian=rng.normal(size=(len(found.examination.jacobian), len(point))) * 0.05))
+        result, space=space, best=best, evaluations=evaluations,
+        estimates=parameter_estimates(space, best, uncertainty),
+        examination=replace(result.examination, uncertainty=uncertainty, regular=True, noise=0.001,
+                            jacobian=rng.normal(size=(len(result.examination.jacobian), len(point))) * 0.05))

@@ -100,7 +100,7 @@ def values(status):
 
 
 def whole(result):
-    return values(next(one for one in result.status if one.name == 'calibration'))
+    return values(next(status for status in result.status if status.name == 'calibration'))
 
 
 @contextmanager
@@ -118,19 +118,23 @@ def robot_of(environment, kind=Robot, **arguments):
 
 
 @contextmanager
-def child(environment, folder, *arguments, seconds=0.0):
-    """Run the node with the toy in a process of its own."""
-    folder.mkdir(exist_ok=True)
+def python_process(environment, *arguments):
+    """Run Python in a process group of its own, and kill it at the end."""
     process = subprocess.Popen(
-        [sys.executable, str(CHILD), str(seconds), '--ros-args', '-p', f'output_directory:={folder}',
-         *arguments],
-        env={**environment, 'PYTHONPATH': os.pathsep.join(sys.path)}, stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE, text=True, start_new_session=True)
+        [sys.executable, *arguments], env={**environment, 'PYTHONPATH': os.pathsep.join(sys.path)},
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
     try:
         yield process
     finally:
         process.kill()
         process.communicate()
+
+
+def child(environment, folder, *arguments, seconds=0.0):
+    """Run the node with the toy in a process of its own."""
+    folder.mkdir(exist_ok=True)
+    return python_process(environment, str(CHILD), str(seconds), '--ros-args', '-p',
+                          f'output_directory:={folder}', *arguments)
 
 
 def ended(process):

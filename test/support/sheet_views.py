@@ -8,7 +8,7 @@ import math
 import cv2
 import numpy as np
 
-from dlo_calibration.vision.camera import Lens
+from dlo_calibration.vision.lens import Lens
 from dlo_calibration.vision.scale import Scale
 
 SIZE = 1600, 1200
@@ -48,8 +48,8 @@ def seen_sheet(camera, sheet, width, height, origin=(0.0, 0.0), turn=0.0, noise=
     places = camera.points(np.stack([u.ravel(), v.ravel()], axis=1))[:, :2]
     x, y = turned(places - origin, -turn).T
     v, u = np.mgrid[:rows, :columns].astype(np.float32) / step
-    at = [cv2.remap((one * len(sheet) / height - 0.5).reshape(rows // step + 1, -1), u, v, cv2.INTER_LINEAR)
-          .astype(np.float32) for one in (x, height - y)]
+    at = [cv2.remap((axis * len(sheet) / height - 0.5).reshape(rows // step + 1, -1), u, v, cv2.INTER_LINEAR)
+          .astype(np.float32) for axis in (x, height - y)]
     middle = [[(columns - 1) / 2.0, (rows - 1) / 2.0]]
     pixel = float(camera.metres_per_pixel(middle)[0]) * len(sheet) / height  # in the sheet's
     soft = cv2.GaussianBlur(sheet.astype(np.float32) * 0.7 + 40.0, (0, 0), max(0.5 * pixel, 0.5))

@@ -26,9 +26,9 @@ def properties(flexibility, elasticity, mass, damping=0.0, internal_damping=0.0,
     :param profile: bending stiffness of parts of equal length, relative to that of the first part.
     :param rest_curvature: pairs of components of the natural curvature [1/m].
     """
-    parts = {f'stiffness_{part}': one for part, one in enumerate(profile[1:], start=2)}
-    knots = {f'rest_curvature_{axis}{knot}': one for knot, pair in enumerate(rest_curvature, start=1)
-             for axis, one in zip('xy', pair, strict=True)}
+    parts = {f'stiffness_{part}': ratio for part, ratio in enumerate(profile[1:], start=2)}
+    knots = {f'rest_curvature_{axis}{knot}': component for knot, pair in enumerate(rest_curvature, start=1)
+             for axis, component in zip('xy', pair, strict=True)}
     return {'flexibility': flexibility, 'elasticity': elasticity, 'mass': mass, 'damping': damping,
             'internal_damping': internal_damping, 'friction': 0.0, 'self_collision': ALONE,
             **parts, **knots, **others}
@@ -115,18 +115,30 @@ class Touching:
 
     def __init__(self, places, radius, friction, time_step):
         self._places, self._step = places, time_step
-        self._physical = {
-            **properties(1.0, 1.0, 1.0), 'self_collision': radius, 'friction': friction}
+        self._physical = {  # without internal forces; markers are its mass
+            **properties(0.0, 0.0, 1e-300, marker_mass=1.0), 'self_collision': radius, 'friction': friction}
 
     def start(self, points):
         """Take the (N, 3) [m] points at the start."""
-        start = core.Start(self._places, points, np.zeros_like(points))
-        self.rope = core.Rope(start, self._physical, self._step, NO_TABLE, np.zeros(3))
+        self._start, self._moved, self._rope = points.copy(), np.zeros_like(points), None
 
     def velocities(self, points, velocities, inverse_masses, support):
-        """Return the (N, 3) [m/s] velocities that contacts allow."""
-        rope = self.rope
-        rope.points[:], rope.predicted[:], rope.support[:] = points, velocities, support
-        rope.inverse_masses[:] = inverse_masses
-        rope.touch()
-        return rope.predicted.copy()
+        """
+        Return the (N, 3) [m/s] velocities that contacts allow.
+
+        :param inverse_masses: (N,) [1/kg], 0 for held nodes; those of the first call count.
+        """
+        if self._rope is None:
+            masses = 1 / np.where(inverse_masses > 0, inverse_masses, 1.0)
+            start = core.Start(self._places, self._start, self._moved, masses)
+            self._rope = core.Rope(start, self._physical, self._step, NO_TABLE, np.zeros(3))
+            self._rope.hold(np.flatnonzero(inverse_masses == 0).tolist())
+        rope = self._rope
+        rope.points[:], rope.support[:] = points, support
+        # A step looks for contacts according to the velocities of the last one, by which the points moved.
+        for begun in (self._moved, velocities):
+            rope.velocities[:] = begun
+            rope.aim((points + self._step * begun)[rope.held])
+            assert rope.predict()
+        self._moved = rope.predicted.copy()
+        return self._moved

@@ -22,12 +22,12 @@ def values(status):
 
 
 def whole(result):
-    return values(next(one for one in result.status if one.name == 'calibration'))
+    return values(next(status for status in result.status if status.name == 'calibration'))
 
 
 class ToyNode:
     """
-    A graph in which whatever is published is heard at once; `ahead` [s] lets time pass.
+    A graph in which whatever is published is heard at once; `elapsed` [s] lets time pass.
 
     A subclass makes the `session`.
 
@@ -36,12 +36,12 @@ class ToyNode:
 
     def __init__(self, name, inputs, outputs):
         self.name, self.inputs, self.outputs = name, inputs, outputs
-        self.ahead = 0.0
+        self.elapsed = 0.0
         self.heard, self.logged, self.waiting = defaultdict(list), defaultdict(list), []
         self.info, self.warn, self.error = (self.logged[level].append for level in ('info', 'warn', 'error'))
 
     def clock(self):
-        return time.monotonic() + self.ahead
+        return time.monotonic() + self.elapsed
 
     def stamp(self):
         return MINUTE

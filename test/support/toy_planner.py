@@ -33,13 +33,13 @@ class ToyPlan:
     def __init__(self, held=False, error=None, **changes):
         self.held, self.error, self.changes = held, error, changes
         self.calls = []
-        self.told = threading.Event()  # it has told its progress
+        self.reported = threading.Event()  # it has reported its progress
 
-    def __call__(self, found, start, goal, options, *, simulation, on_progress, should_stop, **_):
-        self.calls.append((found, start, goal, options, simulation))
+    def __call__(self, dlo, start, goal, options, *, simulation, on_progress, should_stop, **_):
+        self.calls.append((dlo, start, goal, options, simulation))
         for k in range(100):
             on_progress(PlanProgress(1, k, 100, 0.1 / (k + 1), 1.0))
-        self.told.set()
+        self.reported.set()
         while self.held and not should_stop():
             time.sleep(0.002)
         if self.error is not None:
@@ -58,7 +58,7 @@ class PlannerGraph(ToyNode):
         self.session.status_period = 0.0
 
     def clock(self):
-        return self.ahead
+        return self.elapsed
 
     def options(self):
         return PlannerOptions.of(self.set)
@@ -87,7 +87,7 @@ class PlannerGraph(ToyNode):
     @property
     def steps(self):
         """The plans that were published."""
-        return [json.loads(one.data) for one in self.heard['steps']]
+        return [json.loads(message.data) for message in self.heard['steps']]
 
 
 def description(text=None):

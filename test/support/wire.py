@@ -38,12 +38,12 @@ def wire(types):
 
 def result_values(message):
     """Read the parameters of a `result` message: name -> key -> number, text or bool."""
-    found = {}
-    for one in message.status:
-        if one.name != WHOLE:
-            values = {pair.key: pair.value for pair in one.values}
-            found[one.name] = {
+    parameters = {}
+    for status in message.status:
+        if status.name != WHOLE:
+            values = {pair.key: pair.value for pair in status.values}
+            parameters[status.name] = {
                 key: value == 'true' if key == 'identifiable' else
                 value if key.endswith(('unit', 'verdict', 'note')) else float(value)
                 for key, value in values.items()}
-    return found
+    return parameters

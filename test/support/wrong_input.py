@@ -316,34 +316,34 @@ def fuzzed_pairs(types: MessageTypes, frame: str) -> list:
 
 def mutated(octets: bytes, dice: random.Random) -> bytes:
     """Mutate a serialised message or a file: overwrite, cut, lengthen, repeat, swap."""
-    found = bytearray(octets)
+    changed = bytearray(octets)
     for _ in range(dice.randint(1, 3)):
-        if len(found) < 9:
+        if len(changed) < 9:
             break
-        place = dice.randint(0, len(found) - 8)
+        place = dice.randint(0, len(changed) - 8)
         how = dice.choice(('bit', 'byte', 'integer', 'number', 'cut', 'insert', 'remove', 'repeat', 'swap'))
         if how == 'bit':
-            found[place] ^= 1 << dice.randint(0, 7)
+            changed[place] ^= 1 << dice.randint(0, 7)
         elif how == 'byte':
-            found[place] = dice.randint(0, 255)
+            changed[place] = dice.randint(0, 255)
         elif how == 'integer':
             value = dice.choice(INTEGERS) % 2**32
-            found[place // 4 * 4:place // 4 * 4 + 4] = value.to_bytes(4, 'little')
+            changed[place // 4 * 4:place // 4 * 4 + 4] = value.to_bytes(4, 'little')
         elif how == 'number':
-            found[place // 4 * 4:place // 4 * 4 + 8] = np.float64(dice.choice(NUMBERS)).tobytes()
+            changed[place // 4 * 4:place // 4 * 4 + 8] = np.float64(dice.choice(NUMBERS)).tobytes()
         elif how == 'cut':
-            del found[place:]
+            del changed[place:]
         elif how == 'insert':
-            found[place:place] = bytes(dice.randint(0, 255) for _ in range(dice.randint(1, 8)))
+            changed[place:place] = bytes(dice.randint(0, 255) for _ in range(dice.randint(1, 8)))
         elif how == 'remove':
-            del found[place:place + dice.randint(1, 8)]
+            del changed[place:place + dice.randint(1, 8)]
         else:
-            piece = found[place:place + dice.choice((8, 100, 1000))]
-            other = dice.randint(0, len(found) - 1)
+            piece = changed[place:place + dice.choice((8, 100, 1000))]
+            other = dice.randint(0, len(changed) - 1)
             if how == 'swap':
-                found[place:place + len(piece)] = found[other:other + len(piece)]
-            found[other:other + (len(piece) if how == 'swap' else 0)] = piece
-    return bytes(found)
+                changed[place:place + len(piece)] = changed[other:other + len(piece)]
+            changed[other:other + (len(piece) if how == 'swap' else 0)] = piece
+    return bytes(changed)
 
 
 def mutated_bytes(octets: bytes) -> st.SearchStrategy[bytes]:
@@ -355,12 +355,12 @@ def _places(message: Any) -> list:
     """List (object, attribute) of everything in a message that can be set."""
     places, waiting = [], [message]
     while waiting:
-        one = waiting.pop()
-        for name in vars(one) if hasattr(one, '__dict__') else ():
-            value = getattr(one, name)
+        part = waiting.pop()
+        for name in vars(part) if hasattr(part, '__dict__') else ():
+            value = getattr(part, name)
             if name.startswith('__'):
                 continue
-            places.append((one, name))
+            places.append((part, name))
             several = value if isinstance(value, list) else [value]
             waiting += [each for each in several if hasattr(each, '__msgtype__')]
     return places
@@ -372,34 +372,34 @@ def mutated_fields(draw, make: Callable[[], Any]) -> Any:
     message = make()
     for _ in range(draw(st.integers(1, 3))):
         places = _places(message)
-        one, name = places[draw(st.integers(0, len(places) - 1))]
-        value = getattr(one, name)
+        part, name = places[draw(st.integers(0, len(places) - 1))]
+        value = getattr(part, name)
         if isinstance(value, bool):
-            setattr(one, name, not value)
+            setattr(part, name, not value)
         elif isinstance(value, int):
             number = draw(st.sampled_from(INTEGERS))
             bits = 8 if name == 'datatype' else 32
-            setattr(one, name, number if name == 'sec' else number % 2**bits)
+            setattr(part, name, number if name == 'sec' else number % 2**bits)
         elif isinstance(value, float):
-            setattr(one, name, draw(st.one_of(st.sampled_from(NUMBERS), st.floats())))
+            setattr(part, name, draw(st.one_of(st.sampled_from(NUMBERS), st.floats())))
         elif isinstance(value, str):
-            setattr(one, name, draw(st.sampled_from(TEXTS)))
+            setattr(part, name, draw(st.sampled_from(TEXTS)))
         elif isinstance(value, np.ndarray):
             table = value.copy()
             places = draw(st.lists(st.integers(0, max(len(table) // 8 - 1, 0)), max_size=3))
             for place in places if len(table) >= 8 else ():
                 number = np.float64(draw(st.sampled_from(NUMBERS)))
                 table[8 * place:8 * place + 8] = np.frombuffer(number.tobytes(), np.uint8)
-            setattr(one, name, table[:draw(st.sampled_from((len(table), len(table) // 2, 0)))])
+            setattr(part, name, table[:draw(st.sampled_from((len(table), len(table) // 2, 0)))])
         elif isinstance(value, list):
-            setattr(one, name, draw(st.sampled_from((value, value[:-1], value * 2, value[::-1], []))))
+            setattr(part, name, draw(st.sampled_from((value, value[:-1], value * 2, value[::-1], []))))
     return message
 
 
 def mutations(frame):
     """Return a strategy of (kind, bytes), each a mutated message."""
     return st.sampled_from(serialised(frame)).flatmap(
-        lambda one: st.tuples(st.just(one[0]), mutated_bytes(one[1])))
+        lambda pair: st.tuples(st.just(pair[0]), mutated_bytes(pair[1])))
 
 
 @functools.cache

@@ -69,7 +69,7 @@ def on_top(points):
     index = np.arange(len(dense))
     gaps[np.abs(index[:, None] - index) < 30] = np.inf
     first, second = sorted(np.unravel_index(gaps.argmin(), gaps.shape))
-    assert gaps[first, second] < 0.004, 'it does not cross itself'
+    assert gaps[first, second] < 0.004, 'no crossing'
     return dense[second, 2] - dense[first, 2]
 
 

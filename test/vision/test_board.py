@@ -35,7 +35,7 @@ ORIGIN, TURN = np.array([0.12, -0.1]), 25.0
 
 @functools.cache
 def printed_sheet(paper):
-    """Return (rows, columns) grey values of the sheet as it is printed, 200 pixels an inch."""
+    """Return (rows, columns) grey values of the printed sheet, 200 pixels an inch."""
     stream = io.BytesIO()
     board_figure(paper).savefig(stream, format='png', dpi=200)
     return np.asarray(Image.open(stream).convert('L'))
@@ -154,7 +154,7 @@ def test_opencv_before_4_7_finds_the_same(monkeypatch):
 
 
 def test_opencvs_own_board_is_the_same():
-    """The board is what OpenCV calls a ChArUco board, of which other programs find the corners, too."""
+    """The board is OpenCV's ChArUco board, so other programs find its corners, too."""
     if not hasattr(cv2.aruco, 'CharucoDetector'):
         pytest.skip('this OpenCV has the old interface')
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_100)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The way along a ridge: where it goes, and that no other costs less."""
+"""The path along a ridge: where it goes, and that no other costs less."""
 
 from itertools import pairwise, product
 
@@ -24,21 +24,20 @@ def ridge():
     return Ridge(1.0, hessian, 0.0, 3.0)
 
 
-def test_the_way_goes_straight_on_at_a_crossing(ridge):
-    found = path.way(ridge, CLICKS[:2], 3.0)
-    assert np.abs(found[:, 1] - 20).max() == 0
-    assert (np.diff(found[:, 0]) > 0).all() and np.ptp(found[:, 0]) > 40
+def test_the_path_goes_straight_on_at_a_crossing(ridge):
+    pixels = path.ridge_path(ridge, CLICKS[:2], 3.0)
+    assert np.abs(pixels[:, 1] - 20).max() == 0
+    assert (np.diff(pixels[:, 0]) > 0).all() and np.ptp(pixels[:, 0]) > 40
 
 
-def test_the_way_passes_all_clicks_in_their_order(ridge):
-    found = path.way(ridge, CLICKS, 3.0)
-    apart = np.linalg.norm(found[:, None] - CLICKS, axis=2)
-    assert (apart.min(axis=0) <= (4, 3, 3)).all()  # it begins one pixel after that at the first click
-    assert (np.diff(apart.argmin(axis=0)) > 0).all()
+def test_the_path_passes_all_clicks_in_their_order(ridge):
+    distances = np.linalg.norm(path.ridge_path(ridge, CLICKS, 3.0)[:, None] - CLICKS, axis=2)
+    assert (distances.min(axis=0) <= (4, 3, 3)).all()  # it begins one pixel after the first click's pixel
+    assert (np.diff(distances.argmin(axis=0)) > 0).all()
 
 
 def move_cost(ridge, before, after):
-    """Return what a move between two pixels (x, y) costs, its direction aside."""
+    """Return the cost of a move between two pixels (x, y), without that of its direction."""
     x, y = np.subtract(after, before)
     halfway = (before[0] + after[0]) // 2, (before[1] + after[1]) // 2
     xx, xy, yy = (ridge.hessian[after[::-1]].astype(float) + ridge.hessian[halfway[::-1]]) / 2
@@ -48,13 +47,13 @@ def move_cost(ridge, before, after):
 
 
 def bend_cost(before, after):
-    """Return what one move after another one costs, given their directions; inf: it is too sharp a bend."""
+    """Return the cost of a bend between two moves, given their directions; inf: it is too sharp."""
     turn = abs((after - before + 8) % 16 - 8)
     return path.BEND * turn ** 2 if turn <= 2 else np.inf
 
 
 @pytest.mark.parametrize('seed', range(4))
-def test_no_other_way_costs_less(seed):
+def test_no_other_path_costs_less(seed):
     random = np.random.default_rng(seed)
     width, height, reach = 14, 11, 1.5
     ridge = Ridge(1.0, random.normal(scale=0.5, size=(height, width, 3)).astype(np.float32), 0.1, 3.0)
@@ -75,18 +74,19 @@ def test_no_other_way_costs_less(seed):
     graph = coo_array((costs, (rows, columns)), shape=(source + 1, source + 1)).tocsr()
     least = (dijkstra(graph, indices=source)[:-1] + ends)[ends <= reach].min()
 
-    found = [tuple(pixel) for pixel in path.way(ridge, np.array([first, last]), reach).astype(int).tolist()]
+    pixels = path.ridge_path(ridge, np.array([first, last]), reach).astype(int)
+    pixels = [tuple(pixel) for pixel in pixels.tolist()]
     totals = []
     for begin in zip(x[begins <= reach].tolist(), y[begins <= reach].tolist(), strict=True):
-        line = [begin, *found]
+        line = [begin, *pixels]
         if all(tuple(np.subtract(b, a).tolist()) in moves for a, b in pairwise(line)):
             directions = [moves.index(tuple(np.subtract(b, a).tolist())) for a, b in pairwise(line)]
-            totals.append(np.hypot(*np.subtract(begin, first)) + np.hypot(*np.subtract(found[-1], last))
+            totals.append(np.hypot(*np.subtract(begin, first)) + np.hypot(*np.subtract(pixels[-1], last))
                           + sum(move_cost(ridge, a, b) for a, b in pairwise(line))
                           + sum(bend_cost(a, b) for a, b in pairwise(directions)))
     assert min(totals) == pytest.approx(least, rel=1e-6)
 
 
-def test_beyond_the_limit_there_is_no_way(ridge, monkeypatch):
-    monkeypatch.setattr(path, 'MOST', 200)
-    assert path.way(ridge, CLICKS, 3.0).shape == (0, 2)
+def test_beyond_the_limit_of_states_there_is_no_path(ridge, monkeypatch):
+    monkeypatch.setattr(path, 'MAXIMUM_STATES', 200)
+    assert path.ridge_path(ridge, CLICKS, 3.0).shape == (0, 2)

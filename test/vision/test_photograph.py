@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Photographs are read upright and in colour, whatever wrote them; anything else gets one sentence."""
+"""Photographs are read upright and in colour from any camera; any other file is refused in one sentence."""
 
 import io
 import os
@@ -20,7 +20,7 @@ WIDTH, HEIGHT = 160, 120
 
 
 def picture():
-    """Return a picture of which no two corners look alike."""
+    """Return a picture with four different corners."""
     v, u = np.mgrid[:HEIGHT, :WIDTH]
     return Image.fromarray(np.stack([u + 40, 2 * v, 255 - u], axis=2).astype(np.uint8))
 
@@ -42,14 +42,14 @@ def refusal(content):
     return str(caught.value)
 
 
-def exif(orientation=1, film=None, taken=None):
+def exif(orientation=1, film=None, original=None):
     fields = Image.Exif()
     fields[0x0112] = orientation
     settings = {}
     if film is not None:
         settings[0xA405] = film
-    if taken is not None:
-        settings[0xA002], settings[0xA003] = taken
+    if original is not None:
+        settings[0xA002], settings[0xA003] = original
     fields[0x8769] = settings
     return fields
 
@@ -94,7 +94,7 @@ def test_a_png_with_16_bits_a_channel_becomes_8():
     assert np.array_equal(read(content).pixels, image)
 
 
-def test_what_is_transparent_becomes_white():
+def test_transparent_pixels_become_white():
     image = picture().convert('RGBA')
     image.putalpha(Image.new('L', image.size, 0))
     assert (read(octets(image, 'PNG')).pixels == 255).all()
@@ -108,15 +108,15 @@ def test_of_several_pictures_in_a_file_the_first_is_read():
 
 
 @pytest.mark.parametrize('orientation', [1, 6])
-def test_the_focal_length_is_told_by_the_file(orientation):
+def test_the_focal_length_is_read_from_the_file(orientation):
     """26 mm of 35 mm film: the diagonal of 43.27 mm is seen under the same angle."""
     content = octets(picture(), exif=exif(orientation, 26, (WIDTH, HEIGHT)))
     assert read(content).focal_length == pytest.approx(26 / 43.2666 * 200.0, rel=1e-4)
 
 
-@pytest.mark.parametrize('film, taken', [(None, None), (0, None), (26, (160, 90)), (3000, None)])
-def test_a_focal_length_that_is_not_this_pictures_is_unknown(film, taken):
-    assert read(octets(picture(), exif=exif(1, film, taken))).focal_length is None
+@pytest.mark.parametrize('film, original', [(None, None), (0, None), (26, (160, 90)), (3000, None)])
+def test_an_absent_or_wrong_focal_length_is_unknown(film, original):
+    assert read(octets(picture(), exif=exif(1, film, original))).focal_length is None
 
 
 @pytest.mark.parametrize('fields', [b'Exif\0\0', b'Exif\0\0II*\0\xff\xff\xff\xff', b'Exif\0\0' + bytes(100)])
@@ -139,7 +139,7 @@ def test_damaged_fields_are_no_reason_to_refuse_a_photograph(fields):
     (b'\xff\xd8\xff', 'ends too early'),
     (b'\x89PNG\r\n\x1a\n', 'ends too early'),
 ])
-def test_a_file_that_is_no_photograph_gets_one_sentence(content, words):
+def test_a_file_that_is_no_photograph_is_refused_in_one_sentence(content, words):
     message = refusal(content)
     assert words in message
     assert 'JPEG' in message
@@ -172,7 +172,7 @@ def test_a_damaged_photograph_is_read_or_refused():
 
 
 def header(width, height):
-    """Return a PNG file that ends after its size, so that decoding it would fail."""
+    """Return a PNG file with nearly no data, so that decoding it would fail."""
     fields = b'IHDR' + struct.pack('>IIBBBBB', width, height, 8, 2, 0, 0, 0)
     data = b'IDAT' + zlib.compress(b'\0')
     chunks = [struct.pack('>I', len(chunk) - 4) + chunk + struct.pack('>I', zlib.crc32(chunk))

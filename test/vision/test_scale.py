@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The scale finds where on the table, or above it, a pixel is; points that cannot be right are refused."""
+"""The scale gives the point on or above the table that a pixel shows; impossible points are refused."""
 
 import math
 
@@ -10,7 +10,7 @@ import pytest
 from sheet_views import LENGTH, on_table, overhead, SIZE
 
 from dlo_calibration.errors import InputError
-from dlo_calibration.vision.camera import Lens
+from dlo_calibration.vision.lens import Lens
 from dlo_calibration.vision.pose import scale_from_points
 from dlo_calibration.vision.scale import grid
 
@@ -23,23 +23,23 @@ INSIDE = np.array([[x, y] for x in np.linspace(-0.22, 0.22, 5) for y in np.linsp
 VIEWS = [(0.0, 10.0), (15.0, 100.0), (40.0, 200.0), (40.0, -60.0)]  # tilt and turn [degrees]
 
 
-def found(camera, places, lens=None, focal_length=None, noise=0.0, seed=0):
-    """Return the scale from where a camera sees places (k, 2) on the table."""
+def scale_seen_by(camera, places, lens=None, focal_length=None, noise=0.0, seed=0):
+    """Return the scale from the pixels at which a camera sees places (k, 2) on the table."""
     errors = np.random.default_rng(seed).normal(size=(len(places), 2)) * noise
     pixels = camera.to_pixels(on_table(places)) + errors
     return scale_from_points(pixels, places, camera.size, lens, focal_length)
 
 
 def misplaced(scale, camera, height, places=INSIDE):
-    """Return how far off (n,) a scale places what a camera sees at a height above places (n, 2) [m]."""
+    """Return the errors (n,) of a scale for points at a height above places (n, 2) [m]."""
     truth = on_table(places, height)
     return np.linalg.norm(scale.to_table(camera.to_pixels(truth), height) - truth, axis=1)
 
 
 def refusal(camera, pixels, places):
     with pytest.raises(InputError) as caught:
-        scale_from_points(pixels, places, camera.size, focal_length=LENGTH, thing='--scale')
-    assert str(caught.value).startswith('--scale')
+        scale_from_points(pixels, places, camera.size, focal_length=LENGTH)
+    assert str(caught.value).startswith('scale')
     return str(caught.value)
 
 
@@ -48,11 +48,11 @@ def refusal(camera, pixels, places):
 @pytest.mark.parametrize('tilt, turn', VIEWS)
 def test_a_calibrated_camera_is_found_exactly(tilt, turn, coefficients, places):
     camera = overhead(tilt, turn, coefficients=coefficients)
-    scale = found(camera, places, camera.lens)
+    scale = scale_seen_by(camera, places, camera.lens)
     assert scale.residual < 1e-6
     assert scale.focal_length_known
     assert scale.camera == pytest.approx(camera.camera, abs=1e-4)
-    assert scale.tilt == pytest.approx(math.radians(tilt), abs=1e-3)
+    assert math.acos(-scale.rotation[2, 2]) == pytest.approx(math.radians(tilt), abs=1e-3)
     for height in (0.0, 0.01, 0.2):
         assert misplaced(scale, camera, height).max() < 1e-5
 
@@ -61,32 +61,32 @@ def test_a_fisheye_camera_is_found_exactly():
     camera = overhead(30.0)
     camera = type(camera)(Lens(SIZE, camera.lens.matrix, [-0.02, 0.005, 0.0, 0.0], True), camera.rotation,
                           camera.translation, camera.residuals, True)
-    assert misplaced(found(camera, CORNERS, camera.lens), camera, 0.01).max() < 1e-5
+    assert misplaced(scale_seen_by(camera, CORNERS, camera.lens), camera, 0.01).max() < 1e-5
 
 
 def test_each_point_has_its_height():
     """At a crossing, the upper strand lies higher."""
     camera = overhead(30.0)
-    scale = found(camera, EIGHT, camera.lens)
+    scale = scale_seen_by(camera, EIGHT, camera.lens)
     heights = np.linspace(0.0, 0.05, len(INSIDE))
     truth = on_table(INSIDE, heights)
     assert scale.to_table(camera.to_pixels(truth), heights) == pytest.approx(truth, abs=1e-6)
     assert scale.to_pixels(truth) == pytest.approx(camera.to_pixels(truth), abs=1e-2)
 
 
-def test_height_counts():
+def test_a_point_above_the_table_is_shifted_away_from_the_camera():
     """Seen under 40 degrees, a point seems to lie its height * tan(40 degrees) farther away."""
     camera = overhead(40.0)
-    apart = camera.to_table(camera.to_pixels([[0.0, 0.0, 0.01]]))[0]
-    assert np.linalg.norm(apart) == pytest.approx(0.0102 * math.tan(math.radians(40.0)), rel=0.02)
+    shift = camera.to_table(camera.to_pixels([[0.0, 0.0, 0.01]]))[0]
+    assert np.linalg.norm(shift) == pytest.approx(0.0102 * math.tan(math.radians(40.0)), rel=0.02)
 
 
 @pytest.mark.parametrize('tilt, turn', VIEWS)
 @pytest.mark.parametrize('places', [CORNERS, BOARD], ids=['corners', 'board'])
-def test_marks_that_are_somewhat_off_do_little_harm(tilt, turn, places):
-    """Marks are 0.8 px off, as 2 px of 12 megapixels are; the focal length in the file is by 3 %."""
+def test_small_errors_of_marks_do_little_harm(tilt, turn, places):
+    """Marks are 0.8 px off (2 px of 12 megapixels), and the focal length in the file by 3 %."""
     camera = overhead(tilt, turn)
-    scale = found(camera, places, focal_length=1.03 * LENGTH, noise=0.8 if len(places) == 4 else 0.1)
+    scale = scale_seen_by(camera, places, focal_length=1.03 * LENGTH, noise=0.8 if len(places) == 4 else 0.1)
     assert scale.residual < 8e-4
     missed = misplaced(scale, camera, 0.005)
     assert np.median(missed) < 7e-4
@@ -96,52 +96,52 @@ def test_marks_that_are_somewhat_off_do_little_harm(tilt, turn, places):
 @pytest.mark.parametrize('factor', [0.75, 1.0, 1.5])
 def test_an_unknown_focal_length_is_found_in_a_tilted_view(factor):
     camera = overhead(40.0, distance=0.8 * factor, length=factor * LENGTH)
-    scale = found(camera, EIGHT, noise=0.1)
+    scale = scale_seen_by(camera, EIGHT, noise=0.1)
     assert scale.lens.matrix[0, 0] == pytest.approx(factor * LENGTH, rel=0.03)
     assert not scale.focal_length_known
-    assert any('found from the points' in note for note in scale.notes)
+    assert any('found from the points' in warning for warning in scale.warnings)
     assert misplaced(scale, camera, 0.01).max() < 5e-4
 
 
 def test_an_unknown_focal_length_cannot_be_found_from_above():
-    scale = found(overhead(0.0), CORNERS)
-    assert any('ordinary telephone' in note for note in scale.notes)
-    assert any('10 mm above the table' in note for note in scale.notes)
+    scale = scale_seen_by(overhead(0.0), CORNERS)
+    assert any('ordinary telephone' in warning for warning in scale.warnings)
+    assert any('10 mm above the table' in warning for warning in scale.warnings)
     assert misplaced(scale, overhead(0.0), 0.0).max() < 5e-4
 
 
-def test_a_poor_fit_is_told():
+def test_a_poor_fit_is_reported():
     camera = overhead(20.0)
     places = EIGHT.copy()
     places[6] += (0.006, 0.006)  # m
-    notes = scale_from_points(camera.to_pixels(on_table(EIGHT)), places, SIZE, camera.lens).notes
-    assert any('point 7 by' in note for note in notes)
+    warnings = scale_from_points(camera.to_pixels(on_table(EIGHT)), places, SIZE, camera.lens).warnings
+    assert any('point 7 by' in warning for warning in warnings)
 
 
-def test_a_calibrated_camera_needs_no_note_about_its_lens():
+def test_a_calibrated_camera_causes_no_warning_about_its_lens():
     camera = overhead(20.0)
-    assert found(camera, EIGHT, camera.lens).notes == ()
-    (note,) = found(camera, CORNERS, camera.lens).notes
-    assert 'Four points' in note
+    assert scale_seen_by(camera, EIGHT, camera.lens).warnings == ()
+    (warning,) = scale_seen_by(camera, CORNERS, camera.lens).warnings
+    assert 'Four points' in warning
 
 
-def test_the_many_corners_of_a_board_tell_the_distortion():
+def test_the_many_corners_of_a_board_show_the_distortion():
     camera = overhead(25.0, coefficients=(-0.08, 0.0, 0.0, 0.0))
     places = BOARD - (0.16, 0.0)
     truth = on_table(BOARD - (0.16, 0.0))
     straight = Lens(SIZE, camera.lens.matrix, np.zeros(0))
     pixels = camera.to_pixels(truth) + np.random.default_rng(1).normal(scale=0.1, size=(len(truth), 2))
     ignored = misplaced(scale_from_points(pixels, places, SIZE, straight), camera, 0.0).max()
-    told = misplaced(scale_from_points(pixels, places, SIZE, focal_length=LENGTH), camera, 0.0).max()
-    assert told < 0.5 * ignored
+    corrected = misplaced(scale_from_points(pixels, places, SIZE, focal_length=LENGTH), camera, 0.0).max()
+    assert corrected < 0.5 * ignored
 
 
-def test_the_uncertainty_is_what_errors_are():
+def test_the_uncertainty_agrees_with_the_errors():
     """The mean square of error by uncertainty is 1; the priors make it somewhat less."""
     camera = overhead(20.0)
     ratios = []
     for seed in range(30):
-        scale = found(camera, EIGHT, camera.lens, noise=0.8, seed=seed)
+        scale = scale_seen_by(camera, EIGHT, camera.lens, noise=0.8, seed=seed)
         pixels = camera.to_pixels(on_table(INSIDE, 0.005))
         ratios.append(misplaced(scale, camera, 0.005) / scale.uncertainty(pixels, 0.005))
     assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 1.4
@@ -150,13 +150,13 @@ def test_the_uncertainty_is_what_errors_are():
 def test_the_uncertainty_of_heights_shrinks_with_a_known_focal_length():
     camera = overhead(10.0)
     middle = [[SIZE[0] / 2.0, SIZE[1] / 2.0]]
-    vague, known = (found(camera, CORNERS, lens).uncertainty(middle, 0.01, above=0.0)[0]
+    from_points, calibrated = (scale_seen_by(camera, CORNERS, lens).uncertainty(middle, 0.01, above=0.0)[0]
                     for lens in (None, camera.lens))
-    assert known < 0.7 * vague
+    assert calibrated < 0.7 * from_points
 
 
 @pytest.mark.parametrize('tilt', [0.0, 40.0])
-def test_a_pixel_has_the_size_of_what_it_shows(tilt):
+def test_a_pixel_has_the_size_of_its_square_on_the_table(tilt):
     camera = overhead(tilt, distance=1.0)
     size = camera.metres_per_pixel([[(SIZE[0] - 1) / 2.0, (SIZE[1] - 1) / 2.0]])[0]
     assert size == pytest.approx(1.0 / LENGTH / math.sqrt(math.cos(math.radians(tilt))), rel=1e-3)
@@ -173,7 +173,7 @@ def test_too_few_and_too_many_points_are_refused(count):
     assert f'{count} points' in refusal(overhead(), np.full((count, 2), 5.0), np.zeros((count, 2)))
 
 
-def test_as_many_pixels_as_places_are_wanted():
+def test_pixels_and_places_of_different_numbers_are_refused():
     assert 'shape' in refusal(overhead(), np.zeros((5, 2)), np.zeros((4, 2)))
 
 
@@ -185,7 +185,7 @@ def test_as_many_pixels_as_places_are_wanted():
     (1000.0 * CORNERS, 'give their places in metres'),
     (CORNERS * [[1.0, math.nan]], 'point 1: no finite number'),
 ])
-def test_places_that_tell_no_scale_are_refused(places, words):
+def test_places_that_determine_no_scale_are_refused(places, words):
     camera = overhead()
     pixels = camera.to_pixels(on_table(CORNERS))
     pixels = np.concatenate([pixels, [[800.0, 650.0]]])[:len(places)]
@@ -213,14 +213,14 @@ def test_a_table_seen_as_in_a_mirror_is_refused(places, change):
 
 
 @pytest.mark.parametrize('places', [CORNERS, SIX, EIGHT, BOARD], ids=['four', 'six', 'eight', 'board'])
-@pytest.mark.parametrize('one, other', [(1, 2), pytest.param(3, 4, marks=pytest.mark.long)])
-def test_points_that_were_exchanged_are_named(places, one, other):
+@pytest.mark.parametrize('first, second', [(1, 2), pytest.param(3, 4, marks=pytest.mark.long)])
+def test_exchanged_points_are_named(places, first, second):
     camera = overhead(25.0)
     pixels = camera.to_pixels(on_table(places))
     rows = np.arange(len(places))
-    rows[[one - 1, other - 1]] = other - 1, one - 1
+    rows[[first - 1, second - 1]] = second - 1, first - 1
     message = refusal(camera, pixels, places[rows])
-    assert f'points {one} and {other} seem to be exchanged' in message
+    assert f'points {first} and {second} seem to be exchanged' in message
 
 
 @pytest.mark.parametrize('wrong', [0, 4, 7])

@@ -14,7 +14,7 @@ from rendered_scenes import distances, scene
 
 from dlo_calibration.errors import InputError
 from dlo_calibration.vision import path
-from dlo_calibration.vision.middle_line import steady
+from dlo_calibration.vision.middle_line import best_columns
 from dlo_calibration.vision.tracer import Tracer
 
 SIZE = (1200, 900)  # px
@@ -23,14 +23,14 @@ PLAIN = {'hand': 0, 'loops': 0, 'ground': 'plain', 'pattern': 'plain', 'tilt': 0
 DARK, LIGHT = (0.12, 0.12, 0.14), (0.93, 0.93, 0.90)
 
 
-def taken(one):
-    return photograph(one.camera, one.curve, one.radius, one.look, one.seed)
+def picture(example):
+    return photograph(example.camera, example.curve, example.radius, example.look, example.seed)
 
 
-def judged(one, **options):
+def trace_errors(example):
     """Return the trace of a scene, the distances of 21 points and those of all pixels [mm]."""
-    trace = Tracer(taken(one)).trace(one.clicks, **options)
-    points, off = distances(one, trace.pixels)
+    trace = Tracer(picture(example)).trace(example.clicks)
+    points, off = distances(example, trace.pixels)
     return trace, 1e3 * points, 1e3 * off
 
 
@@ -44,39 +44,39 @@ def judged(one, **options):
 ], ids=lambda changed: ', '.join(changed))
 def test_the_line_is_the_middle_of_the_dlo(changed):
     size = (1600, 1200) if 'tilt' in changed else SIZE  # as much of it is far away
-    one = scene(11, size, off=OFF, **{**PLAIN, 'radius': 0.004, **changed})
-    trace, points, off = judged(one)
+    example = scene(11, size, off=OFF, **{**PLAIN, 'radius': 0.004, **changed})
+    trace, points, off = trace_errors(example)
     # The end of a thick DLO that is seen obliquely looks longer than its axis.
-    oblique = 2e3 * one.radius * (1 / math.cos(one.camera.tilt) - 1)
+    oblique = 2e3 * example.radius * (1 / math.cos(example.camera.tilt) - 1)
     assert points[1:-1].mean() < 1.0 + oblique / 2
     assert off.max() < 2.0 + oblique
     assert trace.sure.mean() > 0.9
-    seen = 2 * one.radius * one.camera.focal_length / one.camera.distance
+    seen = 2 * example.radius * example.camera.focal_length / example.camera.distance
     assert seen / 1.4 < trace.width < seen * 1.4
 
 
 def test_points_are_evenly_spaced_from_the_first_click_to_the_last():
-    one = scene(5, SIZE, off=OFF, **PLAIN)
-    pixels = taken(one)
-    trace, back = Tracer(pixels).trace(one.clicks), Tracer(pixels).trace(one.clicks[::-1])
+    example = scene(5, SIZE, off=OFF, **PLAIN)
+    pixels = picture(example)
+    trace, back = Tracer(pixels).trace(example.clicks), Tracer(pixels).trace(example.clicks[::-1])
     steps = np.linalg.norm(np.diff(trace.pixels, axis=0), axis=1)
     assert 0.5 < steps.min() and steps.max() < 1.1 * steps.min() < 4
-    ends = one.camera.project(one.curve[[0, -1]])
+    ends = example.camera.project(example.curve[[0, -1]])
     assert np.linalg.norm(trace.pixels[[0, -1]] - ends, axis=1).max() < 6
     assert np.linalg.norm(back.pixels[[-1, 0]] - ends, axis=1).max() < 6
     assert not trace.pixels.flags.writeable and not trace.sure.flags.writeable
 
 
-def test_a_loop_is_followed_straight_on_and_its_crossing_is_told():
-    one = scene(11, SIZE, off=OFF, **{**PLAIN, 'loops': 1, 'radius': 0.003})
-    trace, points, _ = judged(one)
+def test_a_loop_is_followed_straight_on_and_its_crossing_is_reported():
+    example = scene(11, SIZE, off=OFF, **{**PLAIN, 'loops': 1, 'radius': 0.003})
+    trace, points, _ = trace_errors(example)
     assert points.mean() < 1.0
     (crossing,) = trace.crossings
-    seen = one.camera.project(one.curve)
-    flat = one.curve[:, :2]
-    apart = np.linalg.norm(flat[:, None] - flat[None], axis=2)
-    apart[np.abs(np.subtract.outer(np.arange(len(flat)), np.arange(len(flat)))) < 60] = 1
-    first, second = sorted(np.unravel_index(np.argmin(apart), apart.shape))
+    seen = example.camera.project(example.curve)
+    flat = example.curve[:, :2]
+    distance = np.linalg.norm(flat[:, None] - flat[None], axis=2)
+    distance[np.abs(np.subtract.outer(np.arange(len(flat)), np.arange(len(flat)))) < 60] = 1
+    first, second = sorted(np.unravel_index(np.argmin(distance), distance.shape))
     arc = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(seen, axis=0), axis=1))])
     assert np.linalg.norm(crossing.pixel - seen[first]) < 8
     assert abs(crossing.first - arc[first]) < 15
@@ -85,40 +85,32 @@ def test_a_loop_is_followed_straight_on_and_its_crossing_is_told():
 
 
 def test_a_part_can_be_traced():
-    one = scene(8, SIZE, off=OFF, **PLAIN)
-    inner = one.camera.project(one.curve[[150, 300, 450]])
-    trace = Tracer(taken(one)).trace(inner + 3)
+    example = scene(8, SIZE, off=OFF, **PLAIN)
+    inner = example.camera.project(example.curve[[150, 300, 450]])
+    trace = Tracer(picture(example)).trace(inner + 3)
     assert np.linalg.norm(trace.pixels[[0, -1]] - inner[[0, -1]], axis=1).max() < 8
 
 
 def test_under_a_hand_the_line_is_not_sure():
-    one = scene(8, SIZE, off=OFF, **{**PLAIN, 'radius': 0.003})
-    middle = one.curve[330, :2]
+    example = scene(8, SIZE, off=OFF, **{**PLAIN, 'radius': 0.003})
+    middle = example.curve[330, :2]
     away = middle / np.linalg.norm(middle)
     hand = Hand(tuple(middle - 0.03 * away), math.atan2(away[1], away[0]))
-    one = dataclasses.replace(one, look=dataclasses.replace(one.look, hands=(hand,)))
-    trace, _, off = judged(one)
+    example = dataclasses.replace(example, look=dataclasses.replace(example.look, hands=(hand,)))
+    trace, _, off = trace_errors(example)
     assert 0.01 < (~trace.sure).mean() < 0.4
     assert off[trace.sure].max() < 2.0
-    hidden = one.camera.project([[*middle, 0.04]])
+    hidden = example.camera.project([[*middle, 0.04]])
     nearest = np.argmin(np.linalg.norm(trace.pixels - hidden, axis=1))
     assert not trace.sure[nearest]
 
 
-def test_the_width_can_be_told():
-    one = scene(5, SIZE, off=OFF, **PLAIN)
-    seen = 2 * one.radius * one.camera.focal_length / one.camera.distance
-    trace, points, _ = judged(one, width=seen)
-    assert points.mean() < 1.0
-    assert 0.75 * seen < trace.width < 1.33 * seen
-
-
 def test_the_same_clicks_give_the_same_line_also_after_others():
-    one = scene(8, SIZE, off=OFF, **PLAIN)
-    tracer = Tracer(taken(one))
-    before = tracer.trace(one.clicks)
-    moved = tracer.trace(one.clicks + 2)
-    again = tracer.trace(one.clicks)
+    example = scene(8, SIZE, off=OFF, **PLAIN)
+    tracer = Tracer(picture(example))
+    before = tracer.trace(example.clicks)
+    moved = tracer.trace(example.clicks + 2)
+    again = tracer.trace(example.clicks)
     np.testing.assert_array_equal(before.pixels, again.pixels)
     assert abs(len(moved.pixels) - len(before.pixels)) < 10
 
@@ -126,17 +118,17 @@ def test_the_same_clicks_give_the_same_line_also_after_others():
 EMPTY = np.full((300, 400, 3), 180, dtype=np.uint8)
 
 
-@pytest.mark.parametrize('clicked, said', [
+@pytest.mark.parametrize('clicks, words', [
     ([(100, 100)], 'two'), ([], 'two'), ([(1, 2, 3), (4, 5, 6)], 'two'), ([(50, 50), (50, 50)], 'one place'),
     ([(50, 50), (500, 50)], 'click 2'), ([(50, 50), (np.nan, 50)], 'click 2'),
     ([(-5, 50), (50, 60)], 'click 1')])
-def test_clicks_that_cannot_be_used_get_one_sentence(clicked, said):
-    with pytest.raises(InputError, match=said):
-        Tracer(EMPTY).trace(clicked)
+def test_clicks_that_cannot_be_used_are_refused_in_one_sentence(clicks, words):
+    with pytest.raises(InputError, match=words):
+        Tracer(EMPTY).trace(clicks)
 
 
 @pytest.mark.parametrize('ground', [pytest.param('plain', marks=pytest.mark.long), 'wood', None])
-def test_where_there_is_no_dlo_it_says_so(ground):
+def test_a_photograph_without_a_dlo_is_refused(ground):
     if ground is None:
         pixels = np.full((900, 1200, 3), 128, dtype=np.uint8)
     else:
@@ -145,15 +137,15 @@ def test_where_there_is_no_dlo_it_says_so(ground):
         Tracer(pixels).trace([(200, 200), (600, 500), (1000, 400)])
 
 
-def test_a_search_that_would_take_too_long_ends_without_a_dlo(monkeypatch):
+def test_a_search_that_takes_too_long_ends_in_a_refusal(monkeypatch):
     pixels = np.random.default_rng(0).integers(0, 255, (200, 300, 3), dtype=np.uint8)
-    monkeypatch.setattr(path, 'MOST', 50)
+    monkeypatch.setattr(path, 'MAXIMUM_STATES', 50)
     with pytest.raises(InputError, match='DLO'):
         Tracer(pixels).trace([(20, 20), (150, 100), (280, 180)])
 
 
 @pytest.mark.parametrize('shape', [(40, 60), (1, 1), (3, 2000)])
-def test_a_tiny_photograph_is_no_crash(shape):
+def test_a_tiny_photograph_is_traced_or_refused(shape):
     pixels = np.random.default_rng(0).integers(0, 255, (*shape, 3), dtype=np.uint8)
     try:
         trace = Tracer(pixels).trace([(0, 0), (shape[1] - 1, shape[0] - 1)])
@@ -162,7 +154,7 @@ def test_a_tiny_photograph_is_no_crash(shape):
     assert np.isfinite(trace.pixels).all()
 
 
-def test_a_straight_line_of_known_place_is_found_to_a_fraction_of_a_pixel():
+def test_a_straight_line_is_located_to_a_fraction_of_a_pixel():
     v = np.arange(600)[:, None] + np.zeros(900)
     middle = 300.3 + 0.05 * np.arange(900)
     inside = np.clip(12.5 - np.abs(v - middle), 0, 1)
@@ -176,11 +168,11 @@ def test_a_straight_line_of_known_place_is_found_to_a_fraction_of_a_pixel():
     assert 23 < trace.width < 27
 
 
-def test_the_columns_have_the_largest_sum_of_all():
+def test_no_other_columns_have_a_larger_sum():
     scores = np.random.default_rng(2).normal(size=(2, 6, 5)).astype(np.float32)
-    for matrix, found, mean in zip(scores, *steady(scores, 0.15), strict=True):
+    for matrix, chosen, mean in zip(scores, *best_columns(scores, 0.15), strict=True):
         sums = {columns: matrix[range(6), columns].sum(dtype=float) - 0.15 * (np.diff(columns) ** 2).sum()
                 for columns in product(range(5), repeat=6) if np.abs(np.diff(columns)).max() <= 2}
         best = max(sums, key=sums.get)
-        assert tuple(found) == best
+        assert tuple(chosen) == best
         assert mean == pytest.approx(sums[best] / 6)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A lifted DLO in two photographs: its curve in space, or why they do not show it."""
+"""The curve in space of a lifted DLO from two photographs; views that do not determine it are refused."""
 
 import math
 
@@ -60,6 +60,6 @@ def test_the_second_line_may_be_clicked_the_other_way_round():
     (lifted() - SAG, SIDES['from the side'], 'below the table'),
     (lifted() + SAG[:, [2, 0, 1]], SIDES['from the other side'], 'second photograph'),
 ], ids=['the same view', 'a part', 'it moved', 'another height', 'another shape'])
-def test_views_that_do_not_tell_are_refused(second, scale, text):
+def test_views_that_do_not_determine_the_curve_are_refused(second, scale, text):
     with pytest.raises(InputError, match=text):
         axis_of_two_views(traced(lifted(), ABOVE), ABOVE, traced(second, scale), scale, DIAMETER)

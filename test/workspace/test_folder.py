@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The folder of a calibration: begun, interrupted, gone on with, complete; for any caller."""
+"""The folder of a calibration: begun, interrupted, resumed, complete; for any caller."""
 
 import ast
-from contextlib import ExitStack
+from contextlib import closing, ExitStack
 import errno
 import os
 from pathlib import Path
@@ -49,16 +49,17 @@ def names(path):
 
 def interrupted(path, source):
     """Leave a calibration with one evaluation in a folder."""
-    with CalibrationFolder(path) as folder:
+    with closing(CalibrationFolder(path)) as folder:
         folder.begin(source, lambda _: None)
         folder.log.add(f'{EVALUATION}-1', Entry(frozen_array([1.0])))
 
 
 def test_a_complete_result_leaves_nothing_unfinished(source, tmp_path):
-    with CalibrationFolder(tmp_path / 'out') as folder:
+    with closing(CalibrationFolder(tmp_path / 'out')) as folder:
         folder.begin(source, lambda _: None)
         assert names(tmp_path / 'out') == {'unfinished'}
-        attempts = folder.complete(result_of(source, folder.log), new_toy, lambda: False, stopped=False)
+        attempts = folder.complete(result_of(source, folder.log), new_toy, lambda: False, stopped=False,
+                                   responsive=False)
     assert not attempts.failure
     assert names(tmp_path / 'out') == {RESULT, SESSION, REPORT, EVALUATIONS}
     assert read_result(tmp_path / 'out' / RESULT).evaluations == 6
@@ -69,18 +70,19 @@ def test_the_log_stays_if_a_file_cannot_be_written(source, tmp_path, monkeypatch
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(folder_module, 'write_result', full)
-    with CalibrationFolder(tmp_path / 'out') as folder:
+    with closing(CalibrationFolder(tmp_path / 'out')) as folder:
         folder.begin(source, lambda _: None)
-        attempts = folder.complete(result_of(source, folder.log), new_toy, lambda: False, stopped=False)
+        attempts = folder.complete(result_of(source, folder.log), new_toy, lambda: False, stopped=False,
+                                   responsive=False)
     assert attempts.failure == f'{RESULT}: No space left on device'
     assert CalibrationFolder.is_unfinished(tmp_path / 'out')
 
 
-def test_an_interrupted_calibration_selects_what_it_selected(tmp_path):
+def test_a_resumed_calibration_has_the_selection_of_the_interrupted_one(tmp_path):
     source = source_with(tmp_path, seed=7)
     interrupted(tmp_path / 'out', source)
-    with CalibrationFolder(tmp_path / 'out') as folder:
-        selection = folder.resume(Selection(folder.input, {'workers': 3}))
+    with closing(CalibrationFolder(tmp_path / 'out')) as folder:
+        selection = folder.resume(Selection(CalibrationFolder.input_of(tmp_path / 'out'), {'workers': 3}))
         assert selection.path == tmp_path / 'out' / 'unfinished' / SESSION
         assert (selection.options['seed'], selection.options['workers']) == (7, 3)
         warnings = []
@@ -92,7 +94,7 @@ def test_an_interrupted_calibration_selects_what_it_selected(tmp_path):
 def test_another_calibration_is_discarded_only_on_request(source, tmp_path):
     interrupted(tmp_path / 'out', source)
     other = source_with(tmp_path, seed=8)
-    with CalibrationFolder(tmp_path / 'out') as folder:
+    with closing(CalibrationFolder(tmp_path / 'out')) as folder:
         with pytest.raises(InputError, match='1 evaluations of another calibration'):
             folder.begin(other, lambda _: None)
         folder.begin(other, lambda _: None, instead=True)
@@ -102,7 +104,7 @@ def test_another_calibration_is_discarded_only_on_request(source, tmp_path):
 
 def test_two_calibrations_do_not_share_a_folder(source, tmp_path):
     with ExitStack() as stack:
-        stack.enter_context(CalibrationFolder(tmp_path))
+        stack.enter_context(closing(CalibrationFolder(tmp_path)))
         with pytest.raises(InputError, match='another calibration is using'):
             CalibrationFolder(tmp_path)
 

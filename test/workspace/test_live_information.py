@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Trials are appraised beside whoever asks: in order, once each, and they end when told to."""
+"""Trials are appraised in the background: in order, once each, until they are stopped."""
 
 from dataclasses import replace
 import threading
@@ -24,7 +24,7 @@ TRIALS = toy_trials(3)
 
 
 def appraised(appraiser, trials, *rest, **more):
-    """Return what one appraisal finds."""
+    """Return the information from one appraisal."""
     appraiser.start(trials, OPTIONS, *rest, **more)
     assert appraiser.join(PATIENCE)
     return list(appraiser.waiting_information())
@@ -32,10 +32,10 @@ def appraised(appraiser, trials, *rest, **more):
 
 @pytest.fixture
 def appraiser():
-    found = LiveInformation(lambda _: ToySimulator())
-    yield found
-    found.stop()
-    assert found.join(PATIENCE)
+    live = LiveInformation(lambda _: ToySimulator())
+    yield live
+    live.stop()
+    assert live.join(PATIENCE)
 
 
 def test_each_trial_is_appraised_once_after_those_before_it(appraiser):
@@ -63,7 +63,7 @@ def test_a_repeat_to_the_digit_is_a_trial_of_its_own(appraiser):
     assert again.after == pytest.approx(first.after, rel=0.3)
 
 
-def test_without_a_trial_before_it_a_trial_is_appraised_again(appraiser):
+def test_a_trial_is_appraised_again_if_an_earlier_one_is_gone(appraiser):
     appraised(appraiser, TRIALS)
     assert [each.trial for each in appraised(appraiser, [TRIALS[0], TRIALS[2]])] == ['trial 3']
 
@@ -94,7 +94,7 @@ def test_trials_of_a_result_are_not_appraised_and_later_ones_add_to_it(appraiser
     (ToySimulator(crash=True), 'RuntimeError: the toy')])
 def test_a_trial_that_cannot_be_simulated_gives_a_sentence(toy, words):
     information, = appraised(LiveInformation(lambda _: toy), TRIALS[:1])
-    assert information.problem.startswith(words)
+    assert information.failure.startswith(words)
     assert '\n' not in information.words
 
 
@@ -106,7 +106,7 @@ def test_an_engine_that_cannot_be_made_gives_a_sentence():
     assert information.words == 'the information of trial 2 is unknown: no such engine'
 
 
-def test_a_stop_in_the_middle_of_a_rollout_ends_it_and_says_nothing():
+def test_a_stop_in_the_middle_of_a_rollout_ends_it_without_information():
     engine, before = Stoppable(), set(threading.enumerate())
     appraiser = LiveInformation(lambda _: engine)
     appraiser.start(TRIALS, OPTIONS)

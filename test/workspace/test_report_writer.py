@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The reporter writes pages beside everything else, and whatever goes wrong there is told, not raised."""
+"""The report is written in the background, and its errors are collected, not raised."""
 
 import errno
 import os
@@ -16,7 +16,7 @@ from dlo_calibration import calibrate
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.report.page import Origin
 from dlo_calibration.workspace import report_writer
-from dlo_calibration.workspace.report_writer import ReportWriter
+from dlo_calibration.workspace.report_writer import ReportWriter, write_report
 
 OPTIONS = Options.of({'workers': 1, 'evaluations': 20})
 ORIGIN = Origin('session', 'a command', OPTIONS)
@@ -24,7 +24,7 @@ ORIGIN = Origin('session', 'a command', OPTIONS)
 
 @pytest.fixture(scope='module')
 def result():
-    """Return what the toy finds."""
+    """Return a result of the toy simulator."""
     return calibrate(toy_trials(2), OPTIONS, make_simulator=new_toy)
 
 
@@ -86,6 +86,18 @@ def test_a_drawing_process_that_is_killed_costs_the_page_only(result, tmp_path, 
     reporter.close()
     (_, why), = reporter.failures()
     assert why == 'the process that draws it was ended from outside'
+
+
+@pytest.mark.parametrize('responsive', [False, True])
+def test_pictures_are_drawn_in_another_process_only_if_this_one_must_be_responsive(
+        result, tmp_path, monkeypatch, responsive):
+    monkeypatch.setattr(report_writer, 'page_of', name_this_process)
+    write_report(tmp_path / 'page', result, ORIGIN, new_toy, lambda: True, responsive=responsive)
+    assert ((tmp_path / 'page').read_text() != name_this_process()) == responsive
+
+
+def name_this_process(*_):
+    return str(os.getpid())
 
 
 def kill_this_process(*_):

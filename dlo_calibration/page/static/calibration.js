@@ -16,6 +16,7 @@ const SOME = 0.8;
 export class CalibrationStep {
   title = 'Calibrate';
   role = 'goal';
+  listsMissing = true; // of each trial, below
   evaluations = null;
   namespace = '/calibrator';
   sent = null; // what the node answered
@@ -29,14 +30,13 @@ export class CalibrationStep {
   }
 
   what() {
-    return 'The package tries parameters of a simulated DLO until it moves as yours did. Start it when every trial is complete.';
+    return 'The package tries parameters of a simulated DLO until it moves like yours. Start it when every trial is complete.';
   }
 
   missing() {
-    const {state, document: current} = this.app.project;
-    const open = current.trials.map((one, k) => k).filter((k) => !state.trials[k]?.complete);
-    if (!current.trials.length) return ['a trial'];
-    return open.length < current.trials.length ? [] : ['a complete trial'];
+    const {state, document: {trials}} = this.app.project;
+    if (!trials.length) return ['a trial'];
+    return trials.some((trial, k) => state.trials[k]?.complete) ? [] : ['a complete trial'];
   }
 
   done() {
@@ -46,13 +46,13 @@ export class CalibrationStep {
 
   panel() {
     const {app} = this;
-    const {state, document: current} = app.project;
+    const {state, document: edited} = app.project;
     const {calibration} = state;
     const busy = calibration.state === 'calibrating';
     const trials = h(
       'section',
       {key: 'trials', 'aria-label': 'Trials'},
-      current.trials.map((one, k) => this.#trial(state.trials[k], k)),
+      edited.trials.map((trial, k) => this.#trial(state.trials[k], k)),
     );
     const start = h(
       'div.group',
@@ -79,28 +79,54 @@ export class CalibrationStep {
         `Trial ${k + 1} `,
         h(
           'span.verdict',
-          {class: trial.complete ? 'good' : 'bad'},
+          {class: trial.complete ? 'good' : 'weak'},
           trial.complete ? 'complete' : 'not complete',
         ),
       ),
       information
         ? h('p', {}, information.sentence)
         : trial.complete
-          ? h('p.note', {}, 'What it will show is being computed …')
+          ? h('p.note', {}, 'The information of this trial is being computed …')
           : null,
       information?.parameters
         ? h(
             'ul.shows',
             {'aria-label': `What trial ${k + 1} shows`},
-            Object.entries(information.parameters).map(([name, one]) => shows(name, one.after / one.before)),
+            Object.entries(information.parameters).map(([name, deviation]) =>
+              shows(name, deviation.after / deviation.before),
+            ),
           )
         : null,
+      this.#stillMissing(trial.warnings),
       this.#warnings(k),
     );
   }
 
+  #stillMissing(listed) {
+    const errors = listed.filter(({level}) => level === 'error');
+    const remedies = errors.map(({remedy}) => this.app.remedies[remedy]).filter(Boolean);
+    const places = new Map(remedies.map(({text, act}) => [text, act]));
+    return errors.length
+      ? h(
+          'div.missing',
+          {},
+          h('strong', {}, 'Still missing:'),
+          h(
+            'ul',
+            {},
+            errors.map(({text}) => h('li', {}, text)),
+          ),
+          h(
+            'div.row',
+            {},
+            [...places].map(([text, act]) => button(text, act)),
+          ),
+        )
+      : null;
+  }
+
   #warnings(k) {
-    const listed = this.app.project.state.trials[k].remarks;
+    const listed = this.app.project.state.trials[k].warnings.filter(({level}) => level !== 'error');
     if (k === this.app.trial) return warnings(this.app);
     return listed.length
       ? button(`${counted(listed.length, 'warning')}: show`, () => this.app.choose(k, 'goal'))

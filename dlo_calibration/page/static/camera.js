@@ -20,12 +20,12 @@ const NO_DEVICES =
 /**
  * Open the camera's dialogue.
  *
- * @param {(file: File) => void} take is given each photograph that is taken
+ * @param {(file: File) => void} take called with each photograph
  */
 export async function openCamera(take) {
   const dialog = document.getElementById('camera');
   let stream = null;
-  let taken = 0;
+  let count = 0;
   let text = 'The camera is being opened …';
   let failed = false;
   const end = () => stream?.getTracks().forEach((track) => track.stop());
@@ -51,8 +51,8 @@ export async function openCamera(take) {
     canvas.toBlob(
       (blob) => {
         if (!blob) return;
-        taken += 1;
-        text = `Photograph ${taken} is taken.`;
+        count += 1;
+        text = `Photograph ${count} is taken.`;
         take(new File([blob], `camera ${new Date().toLocaleTimeString('en-GB').replace(/:/g, '.')}.jpg`));
         draw();
       },

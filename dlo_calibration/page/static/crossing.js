@@ -87,7 +87,7 @@ export function crossingDrawn(trace, crossing, k, pointed, asked) {
 /** Describe the question. */
 export function question(step, trace, k) {
   const crossing = trace.crossings[k];
-  const one = (name, text) =>
+  const answer = (name, text) =>
     h(
       'button',
       {
@@ -117,8 +117,8 @@ export function question(step, trace, k) {
     h(
       'div.row',
       {},
-      one('first', 'A (blue)'),
-      one('second', 'B (orange)'),
+      answer('first', 'A (blue)'),
+      answer('second', 'B (orange)'),
       h(
         'button.plain',
         {

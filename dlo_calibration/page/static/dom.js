@@ -96,8 +96,8 @@ function update(node, child) {
   const before = node.ownAttributes ?? {};
   const {value, ...others} = child.attributes;
   for (const name of Object.keys(before)) if (!(name in child.attributes)) set(node, name, null);
-  for (const [name, one] of Object.entries(others))
-    if (before[name] !== one || PROPERTIES.has(name)) set(node, name, one);
+  for (const [name, attribute] of Object.entries(others))
+    if (before[name] !== attribute || PROPERTIES.has(name)) set(node, name, attribute);
   node.ownAttributes = child.attributes;
   patch(node, child.children);
   if (value !== undefined) set(node, 'value', value); // after the options of a select
@@ -107,7 +107,7 @@ function set(node, name, value) {
   if (name.startsWith('on')) {
     node[name] = value;
   } else if (name === 'style') {
-    for (const [property, one] of Object.entries(value ?? {})) node.style.setProperty(property, one);
+    for (const [property, text] of Object.entries(value ?? {})) node.style.setProperty(property, text);
   } else if (PROPERTIES.has(name) && name in node) {
     if (node[name] !== value && !(name === 'value' && node.inHand)) node[name] = value ?? '';
   } else if (value === null || value === undefined || value === false) {

@@ -27,7 +27,7 @@ async function collect(entry, files, depth = 0) {
         reader.readEntries(resolve, reject);
       });
       if (!some.length) return;
-      for (const one of some) await collect(one, files, depth + 1);
+      for (const child of some) await collect(child, files, depth + 1);
     }
   }
 }

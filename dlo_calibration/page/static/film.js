@@ -5,7 +5,7 @@
 
 import {h} from './dom.js';
 import {line, traced} from './line.js';
-import {button, legend} from './parts.js';
+import {button, hand, legend} from './parts.js';
 
 export class Film {
   #films = new Map(); // trial and photograph -> film, null while it is simulated
@@ -63,16 +63,7 @@ export class Film {
     return [
       ...traced(app.seen.trace),
       line(film.pixels[k], 'simulated', 'simulated'),
-      ...film.hands.map((hand, i) => {
-        const at = hand[k];
-        return at
-          ? h(
-              'g.playing',
-              {key: `hand${i}`, class: `hand${i % 2}`, 'data-u': at[0], 'data-v': at[1]},
-              h('path', {d: 'M-11-26V-8Q-11 0-3 1M11-26V-8Q11 0 3 1M-11-26H11M0-26V-38'}),
-            )
-          : null;
-      }),
+      ...film.hands.map(({[k]: pixel}, i) => (pixel ? hand(`hand${i}`, `hand${i % 2}`, pixel) : null)),
     ];
   }
 
@@ -109,7 +100,7 @@ export class Film {
   }
 }
 
-/** @returns {number} the last picture that has begun at a time */
+/** @returns {number} index of the frame at a time */
 function frame(times, time) {
   let k = 0;
   while (k + 1 < times.length && times[k + 1] <= time + 1e-9) k++;

@@ -67,7 +67,7 @@ export function placesOf(line, clicks) {
     });
   });
   const places = new Array(clicks.length);
-  let at = best[clicks.length - 1].reduce((low, one, i, all) => (one < all[low] ? i : low), 0);
+  let at = best[clicks.length - 1].reduce((low, cost, i, all) => (cost < all[low] ? i : low), 0);
   for (let k = clicks.length - 1; k >= 0; k--) {
     places[k] = at;
     at = from[k][at];
@@ -83,17 +83,17 @@ export function placesOf(line, clicks) {
 export function passages(line, crossing, width) {
   const offs = line.map((point) => distance(point, crossing));
   const least = (allowed) =>
-    offs.reduce((low, one, i) => (allowed(i) && (low < 0 || one < offs[low]) ? i : low), -1);
-  const one = least(() => true);
-  const apart = [];
+    offs.reduce((low, off, i) => (allowed(i) && (low < 0 || off < offs[low]) ? i : low), -1);
+  const first = least(() => true);
+  const ends = [];
   for (const direction of [-1, 1]) {
     // leave the first passage before looking for the second one
-    let i = one;
+    let i = first;
     while (i >= 0 && i < line.length && offs[i] < 2 * width) i += direction;
-    apart.push(i);
+    ends.push(i);
   }
-  const other = least((i) => i <= apart[0] || i >= apart[1]);
-  return other < 0 ? [one, one] : [Math.min(one, other), Math.max(one, other)];
+  const second = least((i) => i <= ends[0] || i >= ends[1]);
+  return second < 0 ? [first, first] : [Math.min(first, second), Math.max(first, second)];
 }
 
 /**
@@ -129,12 +129,12 @@ function homography(from, to) {
 }
 
 function normalised(points) {
-  const centre = [0, 1].map((k) => points.reduce((sum, one) => sum + one[k], 0) / points.length);
-  const size = Math.max(1e-12, ...points.map((one) => distance(one, centre)));
+  const centre = [0, 1].map((k) => points.reduce((sum, point) => sum + point[k], 0) / points.length);
+  const size = Math.max(1e-12, ...points.map((point) => distance(point, centre)));
   return {
     centre,
     size,
-    points: points.map((one) => [(one[0] - centre[0]) / size, (one[1] - centre[1]) / size]),
+    points: points.map((point) => [(point[0] - centre[0]) / size, (point[1] - centre[1]) / size]),
   };
 }
 

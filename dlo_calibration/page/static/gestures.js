@@ -20,7 +20,7 @@ const ARROWS = {ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowD
  * Listen to the stage.
  *
  * @param {import('./view.js').View} view
- * @param {() => Tool | null} tool what is to be done at the moment
+ * @param {() => Tool | null} tool of the present step
  */
 export function listen(view, tool) {
   const pointers = new Map();
@@ -63,9 +63,9 @@ export function listen(view, tool) {
       const other = [...pointers.entries()].find(([id]) => id !== event.pointerId)?.[1];
       if (!other) return;
       const middle = [(at[0] + other[0]) / 2, (at[1] + other[1]) / 2];
-      const apart = (one) => Math.max(1, Math.hypot(one[0] - other[0], one[1] - other[1]));
+      const spread = (pointer) => Math.max(1, Math.hypot(pointer[0] - other[0], pointer[1] - other[1]));
       view.pan((at[0] - before[0]) / 2, (at[1] - before[1]) / 2);
-      view.zoom(apart(at) / apart(before), ...middle);
+      view.zoom(spread(at) / spread(before), ...middle);
       return;
     }
     gesture.moved ||= Math.hypot(at[0] - gesture.start[0], at[1] - gesture.start[1]) > STILL;
@@ -103,11 +103,11 @@ export function listen(view, tool) {
     if (mark && arrow && tool()?.nudge)
       tool().nudge(
         mark,
-        arrow.map((one) => one * (event.shiftKey ? 10 : 1)),
+        arrow.map((axis) => axis * (event.shiftKey ? 10 : 1)),
       );
     else if (mark && tool()?.press?.(mark, event.key)) used = true;
     else if (event.target !== stage && !mark) used = false;
-    else if (arrow) view.pan(...arrow.map((one) => -one * STEP));
+    else if (arrow) view.pan(...arrow.map((axis) => -axis * STEP));
     else if (event.key === '+' || event.key === '=') view.zoom(1.25);
     else if (event.key === '-') view.zoom(0.8);
     else if (event.key === '0') view.fit();

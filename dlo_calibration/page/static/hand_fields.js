@@ -4,13 +4,10 @@
 /** The fields of a movement of the hands. */
 
 import {h} from './dom.js';
+import {HANDS, spoken} from './hand_names.js';
 import {button, choice, numeric, tick} from './parts.js';
 import {pictures} from './pictures.js';
 
-const HANDS = [
-  ['left_hand', 'left hand'],
-  ['right_hand', 'right hand'],
-];
 const WORDS = {
   height: 'Height of the lift',
   speed: 'Speed of the hand',
@@ -57,8 +54,8 @@ export function stepCard(owner, step, k, open) {
       button(
         '✕',
         () =>
-          owner.change(k, (one, all) => {
-            all.splice(k, 1);
+          owner.change(k, (removed, steps) => {
+            steps.splice(k, 1);
           }),
         {'aria-label': `Remove movement ${k + 1}`, class: 'plain'},
       ),
@@ -70,12 +67,12 @@ export function stepCard(owner, step, k, open) {
           h('p.note', {}, text),
           k
             ? tick({
-                label: 'It begins together with the movement before it',
+                label: 'It begins together with the movement before',
                 checked: step.with_previous,
                 key: 'with',
                 onset: (value) =>
-                  owner.change(k, (one) => {
-                    one.with_previous = value;
+                  owner.change(k, (changed) => {
+                    changed.with_previous = value;
                   }),
               })
             : null,
@@ -89,8 +86,8 @@ function described(owner, step, k, name, field) {
   const set = (value, merge) =>
     owner.change(
       k,
-      (one) => {
-        one[name] = value;
+      (changed) => {
+        changed[name] = value;
       },
       merge,
     );
@@ -100,20 +97,20 @@ function described(owner, step, k, name, field) {
     case 'name':
       return named('Hand', value, set, name);
     case 'names':
-      return value.map((one, i) =>
+      return value.map((hand, i) =>
         named(
           value.length > 1 ? `Hand ${i + 1}` : 'Hand',
-          one,
+          hand,
           (chosen) => set(value.map((other, j) => (j === i ? chosen : other))),
           `${name}${i}`,
         ),
       );
     case 'numbers':
-      return value.map((one, i) =>
+      return value.map((fraction, i) =>
         numeric({
           ...SHARE,
           label: `Point that hand ${i + 1} grips`,
-          value: one,
+          value: fraction,
           minimum,
           maximum,
           key: `${name}${i}`,
@@ -128,7 +125,7 @@ function described(owner, step, k, name, field) {
       return choice({
         label: WORDS[name] ?? name,
         value,
-        choices: field.choices.map((one) => [one, WORDS[one] ?? one]),
+        choices: field.choices.map((option) => [option, WORDS[option] ?? option]),
         key: name,
         onset: set,
       });
@@ -152,14 +149,14 @@ function described(owner, step, k, name, field) {
 }
 
 function named(label, value, set, key) {
-  const known = HANDS.some(([one]) => one === value) ? HANDS : [...HANDS, [value, value]];
-  return choice({label, value, choices: known, onset: set, key});
+  const names = HANDS.includes(value) ? HANDS : [...HANDS, value];
+  return choice({label, value, choices: names.map((name) => [name, spoken(name)]), onset: set, key});
 }
 
-/** Ask where the hand was when the goal photograph was taken: the meaning of the goal depends on it. */
+/** Ask where the hand was in the goal photograph, on which the meaning of the goal depends. */
 function place(owner, step, k, key) {
   const now = step.hold ? 'hold' : step.to ? 'to' : 'there';
-  const one = (value, text, act) =>
+  const option = (value, text, act) =>
     h(
       'label.tick',
       {key: value},
@@ -171,8 +168,8 @@ function place(owner, step, k, key) {
     'fieldset',
     {key},
     h('legend', {}, 'At the goal, the hand …'),
-    one('hold', 'still holds the DLO', free(true)),
-    one(
+    option('hold', 'still holds the DLO', free(true)),
+    option(
       'to',
       step.to
         ? `opened at the marked place (x = ${shown(step.to[0])}, y = ${shown(step.to[1])})`
@@ -185,7 +182,7 @@ function place(owner, step, k, key) {
         owner.markPlace();
       },
     ),
-    one('there', 'opened, and its point stayed where it was', free(false)),
+    option('there', 'opened, and the point stayed there', free(false)),
   );
 }
 
@@ -199,8 +196,8 @@ function waypoints(owner, value, set, key) {
       'p.note',
       {},
       owner.clicks()
-        ? 'Click in the photograph where the hand passed, one place after the other. A height above 0 lifts the point.'
-        : 'Draw the way in the start photograph.',
+        ? 'Click the places that the hand passed, in their order. A height above 0 lifts the point.'
+        : 'Draw the path in the start photograph.',
     ),
     value.length
       ? h(
@@ -218,7 +215,7 @@ function waypoints(owner, value, set, key) {
           h(
             'tbody',
             {},
-            value.map((one, i) =>
+            value.map((waypoint, i) =>
               h(
                 'tr',
                 {key: i},
@@ -228,7 +225,7 @@ function waypoints(owner, value, set, key) {
                   {},
                   numeric({
                     label: `Height of place ${i + 1} in mm`,
-                    value: one[2],
+                    value: waypoint[2],
                     factor: 1e3,
                     minimum: 0,
                     maximum: 5,

@@ -6,9 +6,9 @@
 import {h} from './dom.js';
 import {along, during, nearest, tableMap} from './geometry.js';
 import {stepCard} from './hand_fields.js';
-import {HANDS, labelled, letter} from './hand_names.js';
+import {HANDS, labelled, letter, spoken} from './hand_names.js';
 import {line, traced} from './line.js';
-import {button, legend, mark, problem, warnings} from './parts.js';
+import {button, hand, legend, mark, problem, warnings} from './parts.js';
 import {pictures} from './pictures.js';
 
 const PLACE = 'hands';
@@ -25,25 +25,25 @@ export class HandsStep {
   }
 
   what() {
-    return 'Say what the hand did: where it gripped the DLO, how it moved, and where it opened.';
+    return 'Describe what the hand did: where it gripped the DLO, how it moved, and where it opened.';
   }
 
   /** List [trial, role] without a movement of a hand. */
   open() {
-    return this.app.project.document.trials.flatMap((one, k) => (one.steps.length ? [] : [[k, 'start']]));
+    return this.app.project.document.trials.flatMap((trial, k) => (trial.steps.length ? [] : [[k, 'start']]));
   }
 
   missing() {
     const {trials} = this.app.project.document;
-    const open = trials.flatMap((one, k) =>
-      one.steps.length ? [] : [`what the hand did in trial ${k + 1}`],
+    const open = trials.flatMap((trial, k) =>
+      trial.steps.length ? [] : [`what the hand did in trial ${k + 1}`],
     );
     return trials.length ? open : ['a trial'];
   }
 
   done() {
     const {trials} = this.app.project.document;
-    return trials.length > 0 && trials.every((one) => one.steps.length);
+    return trials.length > 0 && trials.every((trial) => trial.steps.length);
   }
 
   clicks() {
@@ -55,13 +55,13 @@ export class HandsStep {
     return Boolean(this.#step && 'to' in this.#step && !this.#step.hold);
   }
 
-  /** Show the goal photograph, in which the place is marked where the hand opened. */
+  /** Show the goal photograph, to mark the place where the hand opened. */
   markPlace() {
     const {app} = this;
     app.go(3);
     app.choose(app.trial, 'goal');
     if (this.#opening && !this.#step.to)
-      this.#place(this.chosen, this.#marks().find((one) => one.name === `open ${this.chosen} 0`)?.at);
+      this.#place(this.chosen, this.#marks().find((mark) => mark.name === `open ${this.chosen} 0`)?.at);
   }
 
   #place(k, pixel, merge) {
@@ -81,7 +81,7 @@ export class HandsStep {
   }
 
   kind(name) {
-    return this.app.project.state.actions.find((one) => one.kind === name);
+    return this.app.project.state.actions.find((action) => action.kind === name);
   }
 
   panel() {
@@ -98,7 +98,7 @@ export class HandsStep {
         app.role === 'start'
           ? 'Drag the mark along the DLO to the point that the hand gripped.'
           : this.#opening
-            ? 'Click where the hand opened, or drag the mark there. A DLO springs back when the hand opens, so that its point may lie elsewhere now.'
+            ? 'Click where the hand opened, or drag the mark there. The DLO springs back when the hand opens, so its point may now lie elsewhere.'
             : 'The mark shows the gripped point at the goal.',
       ),
       h(
@@ -127,15 +127,15 @@ export class HandsStep {
       h(
         'ul.actions',
         {},
-        this.app.project.state.actions.map((one) =>
+        this.app.project.state.actions.map((action) =>
           h(
             'li',
-            {key: one.kind},
+            {key: action.kind},
             h(
               'button',
-              {type: 'button', onclick: () => this.#add(one.kind)},
-              pictures[one.kind]?.() ?? null,
-              h('span', {}, h('strong', {}, one.title), h('small', {}, one.text)),
+              {type: 'button', onclick: () => this.#add(action.kind)},
+              pictures[action.kind]?.() ?? null,
+              h('span', {}, h('strong', {}, action.title), h('small', {}, action.text)),
             ),
           ),
         ),
@@ -152,7 +152,7 @@ export class HandsStep {
   #add(kind) {
     const {fields} = this.kind(kind);
     const step = {kind, with_previous: false};
-    for (const [name, one] of Object.entries(fields)) step[name] = structuredClone(one.default);
+    for (const [name, field] of Object.entries(fields)) step[name] = structuredClone(field.default);
     this.adding = false;
     this.chosen = this.app.entry.steps.length;
     this.app.role = 'start';
@@ -198,7 +198,7 @@ export class HandsStep {
     return entry.steps.flatMap((step, k) => {
       const hands = step.hands ?? [step.hand];
       const fractions = step.fractions ?? (step.fraction === undefined ? [] : [step.fraction]);
-      const found = fractions.map((fraction, i) => ({
+      const grips = fractions.map((fraction, i) => ({
         name: `grip ${k} ${i}`,
         at: at(fraction),
         hand: hands[i],
@@ -209,12 +209,12 @@ export class HandsStep {
         const way = (step.waypoints ?? []).map(
           ([x, y], i) => map && {name: `way ${k} ${i}`, at: map.pixel([x, y]), hand: hands[0], way: i},
         );
-        return [...found, ...way.filter(Boolean)];
+        return [...grips, ...way.filter(Boolean)];
       }
-      if (!('to' in step) || step.hold) return found.map((one) => ({...one, fixed: true}));
+      if (!('to' in step) || step.hold) return grips.map((grip) => ({...grip, fixed: true}));
       const map = this.#map(role);
-      const to = step.to && map ? map.pixel(step.to) : found[0].at;
-      return [{...found[0], name: `open ${k} 0`, at: to, fixed: !map}];
+      const to = step.to && map ? map.pixel(step.to) : grips[0].at;
+      return [{...grips[0], name: `open ${k} 0`, at: to, fixed: !map}];
     });
   }
 
@@ -222,9 +222,9 @@ export class HandsStep {
     const {app} = this;
     const {seen, role, entry} = app;
     const hands = app.project.state.trials[app.trial]?.hands ?? [];
-    const paths = hands.map((one, i) => [
-      one,
-      (role === 'start' ? one.start_pixels : one.goal_pixels) ?? [],
+    const paths = hands.map((path, i) => [
+      path,
+      (role === 'start' ? path.start_pixels : path.goal_pixels) ?? [],
       i,
     ]);
     const colour = (name) => `hand${Math.max(0, HANDS.indexOf(name)) % 2}`;
@@ -232,19 +232,19 @@ export class HandsStep {
       ...traced(seen.trace),
       ...paths
         .filter(([, pixels]) => pixels.length > 1)
-        .map(([one, pixels, i]) => line(pixels, `way ${colour(one.name)}`, `path${i}`)),
-      ...this.#marks().map((one) => {
+        .map(([{name}, pixels, i]) => line(pixels, `way ${colour(name)}`, `path${i}`)),
+      ...this.#marks().map((place) => {
         const given = {
-          name: one.name,
-          at: one.at,
-          kind: `${colour(one.hand)} ${one.way === undefined ? 'grip' : 'waypoint'}`,
-          text: one.way === undefined ? letter(one.hand) : String(one.way + 1),
-          label: labelled(one, entry),
+          name: place.name,
+          at: place.at,
+          kind: `${colour(place.hand)} ${place.way === undefined ? 'grip' : 'waypoint'}`,
+          text: place.way === undefined ? letter(place.hand) : String(place.way + 1),
+          label: labelled(place, entry),
         };
-        return one.fixed
+        return place.fixed
           ? h(
               'g.shown',
-              {key: one.name, class: given.kind, 'data-u': one.at[0], 'data-v': one.at[1]},
+              {key: place.name, class: given.kind, 'data-u': place.at[0], 'data-v': place.at[1]},
               h('circle.dot', {r: 6.5}),
               h('text', {x: 11, y: -9}, given.text),
             )
@@ -253,14 +253,9 @@ export class HandsStep {
       ...(this.#moving
         ? paths
             .filter(([, pixels]) => pixels.length)
-            .map(([one, pixels, i]) => {
-              const [u, v] = during(one.times, pixels, app.player.time);
-              return h(
-                'g.playing',
-                {key: `playing${i}`, class: colour(one.name), 'data-u': u, 'data-v': v},
-                h('path', {d: 'M-11-26V-8Q-11 0-3 1M11-26V-8Q11 0 3 1M-11-26H11M0-26V-38'}),
-              );
-            })
+            .map(([{name, times}, pixels, i]) =>
+              hand(`playing${i}`, colour(name), during(times, pixels, app.player.time)),
+            )
         : []),
     ];
   }
@@ -311,11 +306,11 @@ export class HandsStep {
     const [what, k, i] = name.split(' ');
     const {app} = this;
     const chain = this.chain(app.role);
-    const {at} = this.#marks().find((one) => one.name === name);
+    const {at} = this.#marks().find((mark) => mark.name === name);
     const pixel = moved(at);
     if (what === 'grip') {
-      const found = nearest(chain, pixel);
-      this.#fraction(Number(k), Number(i), () => found.at / (chain.length - 1), merge);
+      const place = nearest(chain, pixel);
+      this.#fraction(Number(k), Number(i), () => place.at / (chain.length - 1), merge);
       return;
     }
     const map = this.#map(app.role);
@@ -348,8 +343,8 @@ export class HandsStep {
   player() {
     const {app} = this;
     const hands = app.project.state.trials[app.trial]?.hands ?? [];
-    const end = Math.max(0, ...hands.flatMap((one) => one.times));
-    const names = [...new Set((app.entry?.steps ?? []).flatMap((one) => one.hands ?? [one.hand]))];
+    const end = Math.max(0, ...hands.flatMap(({times}) => times));
+    const names = [...new Set((app.entry?.steps ?? []).flatMap((step) => step.hands ?? [step.hand]))];
     return [
       end > 0 && app.seen ? app.player.controls(end, 'Movement of the hands') : null,
       legend(
@@ -357,7 +352,7 @@ export class HandsStep {
           ['sure', 'the DLO’s middle'],
           ...names.map((name) => [
             `mark hand${Math.max(0, HANDS.indexOf(name))} grip`,
-            `${letter(name)}: ${name.replace('_', ' ')}`,
+            `${letter(name)}: ${spoken(name)}`,
           ]),
           hands.length ? ['way', 'its path'] : null,
         ].filter(Boolean),

@@ -1,22 +1,22 @@
 // SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 // SPDX-License-Identifier: Apache-2.0
 
-/** How to take photographs, for beginners. */
+/** How to take photographs: three steps for beginners. */
 
 import {h} from './dom.js';
+import {boards} from './parts.js';
 import {pictures} from './pictures.js';
 
-/** Describe it. */
+/** Describe the steps. */
 export function introduction() {
   const steps = [
     [
       'sheet',
       [
-        'Print the board in its full size and lay it flat beside the DLO; it gives the scale. ',
-        h('a', {href: 'api/board/a4.pdf', download: true}, 'Board for A4'),
-        ' or ',
-        h('a', {href: 'api/board/letter.pdf', download: true}, 'for Letter'),
-        ' (PDF). No printer? Four points whose places you know will do.',
+        'Print the ',
+        boards(),
+        ' in its full size and lay it flat beside the DLO; it gives the scale. ',
+        'No printer? Four points whose places you know will do.',
       ],
     ],
     [

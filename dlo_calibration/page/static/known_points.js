@@ -30,7 +30,7 @@ export class KnownPoints {
         key: 'sheet',
         tall: true,
         choices: [
-          ['own', 'my own: I type their places'],
+          ['own', 'others, whose places I type'],
           ['a4', 'the corners of an A4 sheet'],
           ['letter', 'the corners of a Letter sheet'],
         ],
@@ -43,8 +43,8 @@ export class KnownPoints {
         'p.note',
         {},
         this.#sheet === 'own'
-          ? 'Click each point in the photograph, then type where it lies on the table: x and y in mm, as on a map, from any point that you choose.'
-          : 'Click the four corners counter-clockwise; from the first to the second one runs a long side.',
+          ? 'Click each point in the photograph, then type its place on the table: x and y in mm, as on a map, from any origin that you choose.'
+          : 'Click the four corners counter-clockwise, beginning along a long side.',
       ),
       points.length + drafts.length
         ? h(
@@ -64,11 +64,11 @@ export class KnownPoints {
             h(
               'tbody',
               {},
-              points.map((one, k) =>
+              points.map((point, k) =>
                 this.#row(
                   `known${k}`,
                   `P${k + 1}`,
-                  one.table,
+                  point.table,
                   seen?.scale?.residuals[k],
                   (axis, value) =>
                     value !== null &&
@@ -78,13 +78,13 @@ export class KnownPoints {
                   () => this.#remove(k),
                 ),
               ),
-              drafts.map((one, k) =>
+              drafts.map((draft, k) =>
                 this.#row(
                   `draft${k}`,
                   `P${points.length + k + 1}`,
-                  one.table,
+                  draft.table,
                   null,
-                  (axis, value) => this.#typed(one, axis, value),
+                  (axis, value) => this.#typed(draft, axis, value),
                   () => this.#remove(points.length + k),
                 ),
               ),
@@ -117,11 +117,11 @@ export class KnownPoints {
 
   /** Describe the marks of a photograph. */
   marks(photograph) {
-    return this.#all(photograph).map((one, k) =>
+    return this.#all(photograph).map((point, k) =>
       mark({
         name: `point ${k}`,
-        at: one.pixel,
-        kind: one.table.includes(null) ? 'draft' : 'known',
+        at: point.pixel,
+        kind: point.table.includes(null) ? 'draft' : 'known',
         text: `P${k + 1}`,
         label: `Point ${k + 1}. Arrow keys move it, Delete removes it.`,
       }),
@@ -169,27 +169,27 @@ export class KnownPoints {
 
   #move(k, moved, merge) {
     const {photograph, seen} = this.app;
-    const known = photograph.scale.points.length;
+    const count = photograph.scale.points.length;
     const inside = ([u, v]) => [
       Math.min(seen.width - 1, Math.max(0, u)),
       Math.min(seen.height - 1, Math.max(0, v)),
     ];
-    if (k < known) {
+    if (k < count) {
       this.#change((scale) => {
         scale.points[k].pixel = inside(moved(scale.points[k].pixel));
       }, merge);
     } else {
-      const one = this.#drafts.get(photograph.id)[k - known];
-      one.pixel = inside(moved(one.pixel));
+      const draft = this.#drafts.get(photograph.id)[k - count];
+      draft.pixel = inside(moved(draft.pixel));
       this.app.refresh();
     }
   }
 
   #remove(k) {
     const {photograph} = this.app;
-    const known = photograph.scale.points.length;
-    if (k < known) this.#change((scale) => scale.points.splice(k, 1));
-    else this.#drafts.get(photograph.id).splice(k - known, 1);
+    const count = photograph.scale.points.length;
+    if (k < count) this.#change((scale) => scale.points.splice(k, 1));
+    else this.#drafts.get(photograph.id).splice(k - count, 1);
     this.app.refresh();
   }
 
@@ -204,7 +204,7 @@ export class KnownPoints {
 
   #change(change, merge) {
     const {id} = this.app;
-    this.app.project.edit((now) => change(now.photographs.find((one) => one.id === id).scale), {
+    this.app.project.edit((now) => change(now.photographs.find((photograph) => photograph.id === id).scale), {
       merge,
       place: PLACE,
     });

@@ -15,6 +15,7 @@ import {Project} from './project.js';
 import {ScaleStep} from './scale.js';
 import {TraceStep} from './trace.js';
 import {View} from './view.js';
+import {counted} from './words.js';
 
 const ROLES = {
   start: 'Start',
@@ -35,8 +36,9 @@ class App {
 
   constructor() {
     this.player = new Player(() => this.refresh());
+    this.photographs = new PhotographsStep(this);
     this.steps = [
-      new PhotographsStep(this),
+      this.photographs,
       new ScaleStep(this),
       new TraceStep(this),
       new HandsStep(this),
@@ -68,7 +70,7 @@ class App {
   /** Open the project, at the first step that is not done. */
   async open() {
     await this.project.open();
-    const first = this.steps.findIndex((one) => !one.done());
+    const first = this.steps.findIndex((step) => !step.done());
     this.go(first < 0 ? this.steps.length - 1 : first, false);
   }
 
@@ -124,14 +126,14 @@ class App {
 
   /** List the photographs that are in trials: [trial, role, id], each id once where `once`. */
   used(once = true) {
-    const found = [];
+    const places = [];
     this.project.document.trials.forEach((trial, k) =>
       Object.keys(ROLES).forEach((role) => {
         const id = trial[role];
-        if (id && !(once && found.some((one) => one[2] === id))) found.push([k, role, id]);
+        if (id && !(once && places.some((place) => place[2] === id))) places.push([k, role, id]);
       }),
     );
-    return found;
+    return places;
   }
 
   /** @returns {string} a photograph's place in words, such as 'goal of trial 2' */
@@ -155,7 +157,7 @@ class App {
   }
 
   #render() {
-    const {document: kept, state} = this.project;
+    const {state} = this.project;
     if (!state)
       return patch(of('panel'), [
         h(
@@ -166,7 +168,7 @@ class App {
             : 'The server cannot be reached; this page keeps trying.',
         ),
       ]);
-    this.trial = Math.max(0, Math.min(this.trial, kept.trials.length - 1));
+    this.trial = Math.max(0, Math.min(this.trial, this.project.document.trials.length - 1));
     if (!this.id) this.role = this.entry?.start ? 'start' : 'goal';
     const {current} = this;
     patch(of('top'), this.#top());
@@ -211,7 +213,7 @@ class App {
         h(
           'ol.steps',
           {},
-          this.steps.map((one, k) =>
+          this.steps.map((step, k) =>
             h(
               'li',
               {},
@@ -220,12 +222,12 @@ class App {
                 {
                   type: 'button',
                   'aria-current': k === this.step ? 'step' : null,
-                  class: one.done() ? 'done' : null,
+                  class: step.done() ? 'done' : null,
                   onclick: () => this.go(k),
                 },
-                h('span.number', {'aria-hidden': 'true'}, one.done() ? '✓' : String(k + 1)),
-                h('span.name', {}, one.title),
-                h('span.unseen', {}, one.done() ? ' (done)' : ' (open)'),
+                h('span.number', {'aria-hidden': 'true'}, step.done() ? '✓' : String(k + 1)),
+                h('span.name', {}, step.title),
+                h('span.unseen', {}, step.done() ? ' (done)' : ' (open)'),
               ),
             ),
           ),
@@ -234,16 +236,8 @@ class App {
       h(
         'div.history',
         {},
-        button('↶', () => project.undo(), {
-          disabled: !project.canUndo,
-          'aria-label': 'Undo',
-          title: 'Undo (Ctrl+Z)',
-        }),
-        button('↷', () => project.redo(), {
-          disabled: !project.canRedo,
-          'aria-label': 'Redo',
-          title: 'Redo (Ctrl+Shift+Z)',
-        }),
+        button('Undo', () => project.undo(), {disabled: !project.canUndo, title: 'Ctrl+Z'}),
+        button('Redo', () => project.redo(), {disabled: !project.canRedo, title: 'Ctrl+Shift+Z'}),
       ),
       h(
         'div.messages',
@@ -280,10 +274,11 @@ class App {
     const missing = current.missing();
     const next = this.steps[this.step + 1];
     const open = this.#open();
+    const {adding} = this.photographs;
     return [
       h('h2', {id: 'title', tabindex: -1}, `${this.step + 1} ${current.title}`),
       h('p.what', {}, current.what()),
-      missing.length
+      missing.length && !(current.listsMissing && this.project.document.trials.length)
         ? h('div.missing', {}, h('strong', {}, 'Still missing: '), missing.join('; '), '.')
         : null,
       ...current.panel(),
@@ -300,16 +295,20 @@ class App {
               },
             )
           : null,
+        adding && next
+          ? h('span.note', {}, `Wait until ${counted(adding, 'photograph is', 'photographs are')} added.`)
+          : null,
         next
           ? button(`Next: ${next.title}`, () => this.go(this.step + 1), {
               class: missing.length ? null : 'primary',
+              disabled: adding > 0,
             })
           : null,
       ),
     ];
   }
 
-  /** @returns {[number, string] | null} the next photograph that this step needs, where the one seen is done */
+  /** @returns {[number, string] | null} the next photograph that this step needs, if the shown one is done */
   #open() {
     const {current} = this;
     const open = current.ready

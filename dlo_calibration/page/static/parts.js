@@ -5,13 +5,13 @@
 
 import {h} from './dom.js';
 
-/** Show what was refused at a place of the page. */
+/** Show the last refusal, at its place of the page. */
 export function problem(project, place) {
-  const one = project.problem;
+  const refusal = project.problem;
   return h(
     'div',
     {role: 'alert', key: `problem-${place}`},
-    one && one.place === place ? h('p.problem', {}, one.text) : null,
+    refusal && refusal.place === place ? h('p.problem', {}, refusal.text) : null,
   );
 }
 
@@ -72,7 +72,7 @@ export function choice({label, value, choices, onset, key, tall = false}) {
     h(
       'select',
       {value, onchange: (event) => onset(event.target.value)},
-      choices.map(([one, text]) => h('option', {key: one, value: one}, text)),
+      choices.map(([name, text]) => h('option', {key: name, value: name}, text)),
     ),
   );
 }
@@ -109,6 +109,25 @@ export function files({text, accept, multiple = false, folder = false, onfiles, 
       },
     }),
     h('span', {}, text),
+  );
+}
+
+/** Links to the documents of the board. */
+export function boards() {
+  return [
+    h('a', {href: 'api/board/a4.pdf', download: true}, 'board for A4'),
+    ' or ',
+    h('a', {href: 'api/board/letter.pdf', download: true}, 'board for Letter'),
+    ' (PDF)',
+  ];
+}
+
+/** A hand at a pixel of the photograph. */
+export function hand(key, kind, [u, v]) {
+  return h(
+    'g.playing',
+    {key, class: kind, 'data-u': u, 'data-v': v},
+    h('path', {d: 'M-11-26V-8Q-11 0-3 1M11-26V-8Q11 0 3 1M-11-26H11M0-26V-38'}),
   );
 }
 
@@ -159,29 +178,29 @@ export function legend(entries) {
   );
 }
 
-/** The warnings about a trial that belong to a step; a remedy is a button. */
+/** The warnings about a trial that belong to a step, without what is said to be missing; a remedy is a button. */
 export function warnings(app, step = null) {
-  const listed = (app.project.state.trials[app.trial]?.remarks ?? []).filter(
-    (one) => step === null || (app.remedies[one.remedy]?.step ?? 3) === step,
+  const listed = (app.project.state.trials[app.trial]?.warnings ?? []).filter(({level, remedy}) =>
+    step === null ? level !== 'error' : (app.remedies[remedy]?.step ?? 3) === step && !(level === 'error' && remedy),
   );
   if (!listed.length) return null;
   const names = {error: 'Missing', warning: 'Check', hint: 'Hint'};
   return h(
     'ul.warnings',
     {},
-    listed.map((one) =>
+    listed.map((warning) =>
       h(
         'li',
-        {class: one.level},
-        h('strong', {}, `${names[one.level]}: `),
-        one.text,
-        app.remedies[one.remedy] &&
-          !(one.level === 'error' && app.remedies[one.remedy].step === app.step) &&
-          !['add_click', 'check_length', 'more_points'].includes(app.step === 2 ? one.remedy : '')
+        {class: warning.level},
+        h('strong', {}, `${names[warning.level]}: `),
+        warning.text,
+        app.remedies[warning.remedy] &&
+          !(warning.level === 'error' && app.remedies[warning.remedy].step === app.step) &&
+          !['add_click', 'check_length', 'more_points'].includes(app.step === 2 ? warning.remedy : '')
           ? h(
               'div',
               {},
-              button(app.remedies[one.remedy].text, () => app.remedies[one.remedy].act()),
+              button(app.remedies[warning.remedy].text, () => app.remedies[warning.remedy].act()),
             )
           : null,
       ),

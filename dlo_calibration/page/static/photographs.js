@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 // SPDX-License-Identifier: Apache-2.0
 
-/** Step 1, photographs: their files, and which is the start and the goal of which trial. */
+/** Step 1, photographs: their files, and the start and goal of each trial. */
 
 import {openCamera} from './camera.js';
 import {h} from './dom.js';
@@ -9,17 +9,18 @@ import {dropped} from './dropped.js';
 import {introduction} from './introduction.js';
 import {button, choice, files, problem} from './parts.js';
 import {address} from './picture.js';
+import {counted} from './words.js';
 
 const ACCEPT = 'image/jpeg,image/png,.jpg,.jpeg,.png';
-const PHOTOGRAPH = /\.(jpe?g|png|heic|heif|avif|webp|tiff?|bmp|gif)$/i; // the server explains which of them it refuses
+const PHOTOGRAPH = /\.(jpe?g|png|heic|heif|avif|webp|tiff?|bmp|gif)$/i; // the server refuses some, and says why
 const PLACE = 'photographs';
 const SLOTS = {start: 'Start: before the hand moves', goal: 'Goal: when the DLO lies still again'};
 const SIDES = {start_side: 'Start, seen from the side', goal_side: 'Goal, seen from the side'};
 
 export class PhotographsStep {
   title = 'Photographs';
-  #coming = 0;
-  #refused = [];
+  adding = 0; // photographs on their way to the server
+  #refusals = [];
   #topics = null;
   #last = null; // the newest photograph
 
@@ -53,41 +54,41 @@ export class PhotographsStep {
 
   done() {
     const {trials} = this.app.project.document;
-    return trials.length > 0 && trials.every((one) => one.goal);
+    return trials.length > 0 && trials.every((trial) => trial.goal);
   }
 
   /** Add files, one after the other. */
   async add(chosen) {
-    this.#refused = [];
+    this.#refusals = [];
     const wanted = chosen.length === 1 ? chosen : chosen.filter((file) => PHOTOGRAPH.test(file.name));
     if (chosen.length && !wanted.length)
-      this.#refused.push('There is no photograph among these files: add JPEG or PNG files.');
+      this.#refusals.push('There is no photograph among these files: add JPEG or PNG files.');
     const {app} = this;
-    const before = new Set(app.project.document.photographs.map((one) => one.id));
-    this.#coming += wanted.length;
+    const before = new Set(app.project.document.photographs.map((photograph) => photograph.id));
+    this.adding += wanted.length;
     if (app.step) app.go(0);
     for (const file of wanted) {
       app.say(`${file.name} is being added`);
       app.refresh();
       const answer = await app.project.ask('photographs', {body: file, name: file.name, place: PLACE});
-      this.#coming -= 1;
+      this.adding -= 1;
       if (answer) this.#last = answer.id;
       else {
-        this.#refused.push(app.project.problem.text);
+        this.#refusals.push(app.project.problem.text);
         app.project.clear();
       }
     }
     app.trial = Math.max(
       0,
-      app.project.document.trials.findIndex((one) => !before.has(one.goal ?? one.start)),
+      app.project.document.trials.findIndex((trial) => !before.has(trial.goal ?? trial.start)),
     );
-    app.say(this.#coming ? '' : 'All photographs are there');
+    app.say(this.adding ? '' : 'All photographs are added');
     app.refresh();
   }
 
   panel() {
-    const {document: kept, state} = this.app.project;
-    const some = kept.photographs.length > 0;
+    const {document: {photographs, trials}, state} = this.app.project;
+    const some = photographs.length > 0;
     return [
       some ? null : introduction(),
       h(
@@ -120,11 +121,15 @@ export class PhotographsStep {
           state.ros ? button('Take from a ROS topic …', () => this.#list()) : null,
         ),
         this.#topics ? this.#chooser() : null,
-        h('p.busy', {role: 'status'}, this.#coming ? `${this.#coming} to be added …` : ''),
+        h(
+          'p.busy',
+          {role: 'status'},
+          this.adding ? `${counted(this.adding, 'photograph is', 'photographs are')} being added …` : '',
+        ),
         h(
           'div',
           {role: 'alert'},
-          this.#refused.map((text) => h('p.problem', {}, text)),
+          this.#refusals.map((text) => h('p.problem', {}, text)),
         ),
         problem(this.app.project, PLACE),
       ),
@@ -136,10 +141,10 @@ export class PhotographsStep {
             h(
               'p.note',
               {},
-              'A trial is one movement of the hands: a photograph before, and one after it. ' +
-                'More trials with different movements give a more certain result.',
+              'A trial is one movement of the hands, with a photograph before and after it. ' +
+                'More trials with different movements make the result more certain.',
             ),
-            kept.trials.map((trial, k) => this.#trial(trial, k)),
+            trials.map((trial, k) => this.#trial(trial, k)),
             button('Add a trial', () => this.#addTrial()),
           )
         : null,
@@ -151,7 +156,7 @@ export class PhotographsStep {
             h(
               'ul.photographs',
               {},
-              kept.photographs.map((one) => this.#photograph(one)),
+              photographs.map((photograph) => this.#photograph(photograph)),
             ),
           )
         : null,
@@ -174,22 +179,22 @@ export class PhotographsStep {
     return h(
       'ul.topics',
       {},
-      this.#topics.map((one) =>
+      this.#topics.map((topic) =>
         h(
           'li',
-          {key: one.name},
-          h('code', {}, one.name),
+          {key: topic.name},
+          h('code', {}, topic.name),
           ' ',
           button(
             'Take an image',
             async () => {
-              this.#coming += 1;
+              this.adding += 1;
               this.app.refresh();
-              await this.app.project.ask('topics', {body: {name: one.name}, place: PLACE});
-              this.#coming -= 1;
+              await this.app.project.ask('topics', {body: {name: topic.name}, place: PLACE});
+              this.adding -= 1;
               this.app.refresh();
             },
-            {'aria-label': `Take an image of ${one.name}`},
+            {'aria-label': `Take an image of ${topic.name}`},
           ),
         ),
       ),
@@ -214,8 +219,8 @@ export class PhotographsStep {
         h(
           'p.note',
           {},
-          'From above, one cannot see how high the DLO hangs. A second photograph of the same moment from the side ' +
-            'shows it; it needs a scale, too.',
+          'A photograph from above does not show how high the DLO hangs. A second one, taken from the side at the ' +
+            'same moment, shows it; it needs a scale, too.',
         ),
         h(
           'div.slots',
@@ -230,9 +235,9 @@ export class PhotographsStep {
           'Swap start and goal',
           () =>
             this.#change((now) => {
-              const one = now.trials[k];
-              [one.start, one.goal] = [one.goal, one.start];
-              [one.start_side, one.goal_side] = [one.goal_side, one.start_side];
+              const swapped = now.trials[k];
+              [swapped.start, swapped.goal] = [swapped.goal, swapped.start];
+              [swapped.start_side, swapped.goal_side] = [swapped.goal_side, swapped.start_side];
             }),
           {disabled: !trial.goal},
         ),
@@ -261,7 +266,7 @@ export class PhotographsStep {
         key: 'choice',
         choices: [
           ...(role === 'start' ? [] : [['', 'none yet']]),
-          ...photographs.map((one) => [one.id, one.name]),
+          ...photographs.map((photograph) => [photograph.id, photograph.name]),
         ],
         onset: (value) =>
           this.#change((now) => {
@@ -271,26 +276,28 @@ export class PhotographsStep {
     );
   }
 
-  #photograph(one) {
+  #photograph(photograph) {
     const {app} = this;
-    const seen = app.project.seen(one.id);
+    const seen = app.project.seen(photograph.id);
     const places = app
       .used(false)
-      .filter(([, , id]) => id === one.id)
+      .filter(([, , id]) => id === photograph.id)
       .map(([k, role]) => app.placed(k, role));
     return h(
       'li',
-      {key: one.id, class: one.id === this.#last ? 'latest' : null},
-      h('img', {src: address(one.id, 320), alt: '', loading: 'lazy'}),
+      {key: photograph.id, class: photograph.id === this.#last ? 'latest' : null},
+      h('img', {src: address(photograph.id, 320), alt: '', loading: 'lazy'}),
       h(
         'div',
         {},
-        h('strong', {}, one.name),
+        h('strong', {}, photograph.name),
         h('span.note', {}, seen ? `${seen.width} × ${seen.height} pixels` : ''),
         h('span.note', {}, places.length ? places.join(', ') : 'not used yet'),
         seen?.problem ? h('p.problem', {}, seen.problem) : null,
       ),
-      button('Remove', () => this.#remove(one.id), {'aria-label': `Remove the photograph ${one.name}`}),
+      button('Remove', () => this.#remove(photograph.id), {
+        'aria-label': `Remove the photograph ${photograph.name}`,
+      }),
     );
   }
 
@@ -310,11 +317,12 @@ export class PhotographsStep {
 
   #remove(id) {
     this.#change((now) => {
-      now.photographs = now.photographs.filter((one) => one.id !== id);
-      for (const one of now.photographs) if (one.scale?.photograph === id) one.scale = null;
-      now.trials = now.trials.filter((one) => one.start !== id);
-      for (const one of now.trials)
-        for (const role of ['goal', 'start_side', 'goal_side']) if (one[role] === id) one[role] = null;
+      now.photographs = now.photographs.filter((photograph) => photograph.id !== id);
+      for (const photograph of now.photographs)
+        if (photograph.scale?.photograph === id) photograph.scale = null;
+      now.trials = now.trials.filter((trial) => trial.start !== id);
+      for (const trial of now.trials)
+        for (const role of ['goal', 'start_side', 'goal_side']) if (trial[role] === id) trial[role] = null;
     });
   }
 

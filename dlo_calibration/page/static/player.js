@@ -30,7 +30,7 @@ export class Player {
    *
    * @param {number} end of the motion [s]
    * @param {string} label
-   * @param {string} words what is shown, beside the time
+   * @param {string} words a note beside the time
    */
   controls(end, label, words = '') {
     this.#end = end;

@@ -11,12 +11,12 @@ const RETRY = 1500; // ms until a lost connection is tried again
 const MERGED = 1200; // ms within which edits of one kind are one step of undo
 const MOST_STEPS = 200; // of undo
 
-/** Emits `change` after everything that changes what is shown. */
+/** Emits `change` whenever the page must be drawn again. */
 export class Project extends EventTarget {
   state = null; // the newest of the server
   document = null; // with edits that the server has not seen yet
-  problem = null; // {text, place}: why the last edit or request was refused, and where on the page that belongs
-  notice = null; // what the person should know, such as that another tab changed the project
+  problem = null; // {text, place}: why the last edit or request was refused, and the place of the page for it
+  notice = null; // a warning about the whole project, e.g. that another window changed it
   connected = true;
   #undo = [];
   #redo = [];
@@ -51,7 +51,7 @@ export class Project extends EventTarget {
 
   /** @param {string} id @returns {object | undefined} the photograph in the document */
   photograph(id) {
-    return this.document.photographs.find((one) => one.id === id);
+    return this.document.photographs.find((photograph) => photograph.id === id);
   }
 
   /** @param {string} id @returns {object | undefined} what the server knows of a photograph */
@@ -72,7 +72,7 @@ export class Project extends EventTarget {
    *
    * @param {(document: object) => void} change alters the copy that it is given
    * @param {{merge?: string, place?: string}} how edits with the same `merge` are undone together: those shortly after
-   *   each other, and all where it begins with 'drag'; `place` says where a refusal is shown
+   *   each other, and all if it begins with 'drag'; `place` says where a refusal is shown
    */
   edit(change, {merge = null, place = ''} = {}) {
     const next = structuredClone(this.document);
@@ -120,7 +120,7 @@ export class Project extends EventTarget {
    *
    * @param {string} path below api/
    * @param {{method?: string, body?: *, name?: string, place?: string}} how `name` is that of an uploaded file
-   * @returns {Promise<object | null>} the answer; null where it was refused, which is then shown
+   * @returns {Promise<object | null>} the answer; null: it was refused, and the refusal is shown
    */
   async ask(path, {method = 'POST', body, name, place = ''} = {}) {
     const file = body instanceof Blob;
@@ -233,7 +233,7 @@ export class Project extends EventTarget {
     }
   }
 
-  /** Take the state after a request of this page, which can be undone. */
+  /** Take the state after a request of this page; the request can be undone. */
   #adopt(state) {
     if (state.revision !== this.state.revision) {
       this.#remember();
@@ -245,7 +245,7 @@ export class Project extends EventTarget {
     this.#changed();
   }
 
-  /** Take a state that somebody else made: earlier edits of this page cannot be undone in it. */
+  /** Take a state from another window: earlier edits of this page cannot be undone in it. */
   #foreign(state) {
     const other = JSON.stringify(state.document) !== JSON.stringify(this.document);
     this.state = state;
@@ -269,7 +269,7 @@ export class Project extends EventTarget {
       else if (!this.state) {
         this.state = state;
         this.document = state.document;
-        this.notice = state.problems?.join(' ') || null; // of the project's files
+        this.notice = state.warnings?.join(' ') || null; // of the project's files
       }
       this.#changed();
     } catch {

@@ -5,7 +5,7 @@
 
 import {h} from './dom.js';
 import {button, problem} from './parts.js';
-import {interval, isComponent, measured, millimetres, number, words} from './words.js';
+import {interval, isComponent, measured, number, words} from './words.js';
 
 const MARKS = {identifiable: 'good', 'weakly identifiable': 'weak', 'not identifiable': 'bad'};
 const FILES = {
@@ -15,16 +15,22 @@ const FILES = {
   'request.xml': 'Request (XML)',
   'evaluations.csv': 'All tried parameter sets (CSV)',
 };
+const LEAST = 4; // width of the interval on its bar, of 100, so that the mark of the value never hides it
 const BEFORE = ['session.mcap', 'request.xml']; // are there without a result
 
 /** Describe the result. */
 export function resultPanel(step, calibration) {
   const {result, warnings} = calibration;
-  const texts = [...new Set([...(warnings ?? []), ...(result.warnings ?? [])])];
+  const texts = [...new Set([...(warnings ?? []), ...(result.warnings ?? [])])].filter(
+    (text) => text !== result.unusable, // the headline says it
+  );
   return h(
     'section',
     {key: 'result', 'aria-label': 'Result'},
     h('h3', {}, 'Result', calibration.state === 'stopped' ? ' (stopped before its end)' : ''),
+    result.headline
+      ? h('p.headline', {class: result.unusable ? 'bad' : 'good'}, result.headline)
+      : null,
     h(
       'div.scroll',
       {tabindex: 0, role: 'region', 'aria-label': 'Parameters'},
@@ -47,7 +53,7 @@ export function resultPanel(step, calibration) {
           {},
           Object.entries(result.parameters)
             .filter(([name]) => !isComponent(name))
-            .map(([name, one]) => parameter(name, one)),
+            .map(([name, estimate]) => parameterRow(name, estimate)),
         ),
       ),
     ),
@@ -66,7 +72,6 @@ export function resultPanel(step, calibration) {
     h(
       'p',
       {},
-      `Simulated and measured points lie ${millimetres(result.mean_error_m, 1)} apart on average. `,
       'Watch the film below the photograph: the simulated DLO over your photograph.',
     ),
     files(step.app, calibration),
@@ -74,8 +79,8 @@ export function resultPanel(step, calibration) {
   );
 }
 
-function parameter(name, one) {
-  const verdict = one.verdict || (one.identifiable ? 'identifiable' : 'not identifiable');
+function parameterRow(name, estimate) {
+  const verdict = estimate.verdict || (estimate.identifiable ? 'identifiable' : 'not identifiable');
   return h(
     'tr',
     {key: name},
@@ -89,29 +94,32 @@ function parameter(name, one) {
     h(
       'td',
       {},
-      h('strong', {}, measured(one.physical_value, one.physical_unit)),
+      h('strong', {}, measured(estimate.physical_value, estimate.physical_unit, estimate.physical_upper)),
       h('br'),
-      interval(one.physical_lower, one.physical_upper, one.physical_unit),
-      bar(one),
+      interval(estimate.physical_lower, estimate.physical_upper, estimate.physical_unit),
+      bar(estimate),
       h(
         'small',
         {},
-        `${number(one.value)} (${number(one.lower)} to ${number(one.upper)}) on the scale from 0 to 100`,
+        `${number(estimate.value)} (${interval(estimate.lower, estimate.upper, '1')})`,
+        ' on the scale from 0 to 100',
       ),
-      one.note ? h('small', {}, h('br'), one.note) : null,
+      estimate.note ? h('small', {}, h('br'), estimate.note) : null,
     ),
   );
 }
 
 function bar({value, lower, upper}) {
+  const width = Math.max(LEAST, upper - lower);
+  const left = Math.min(100 - width, Math.max(0, (lower + upper - width) / 2));
   return h(
     'svg',
     {class: 'bar', viewBox: '0 0 100 10', preserveAspectRatio: 'none', 'aria-hidden': 'true'},
     h('rect.whole', {x: 0, y: 3, width: 100, height: 4}),
     lower === null || upper === null
       ? null
-      : h('rect.interval', {x: lower, y: 3, width: Math.max(1, upper - lower), height: 4}),
-    h('rect.value', {x: Math.min(98, Math.max(0, value - 1)), y: 0, width: 2, height: 10}),
+      : h('rect.interval', {x: left, y: 1, width, height: 8}),
+    h('rect.value', {x: Math.min(99, Math.max(0, value - 0.5)), y: 0, width: 1, height: 10}),
   );
 }
 

@@ -6,7 +6,7 @@
 import {h} from './dom.js';
 import {KnownPoints, PLACE} from './known_points.js';
 import {line} from './line.js';
-import {button, choice, files, legend, numeric, problem} from './parts.js';
+import {boards, button, choice, files, legend, numeric, problem} from './parts.js';
 import {millimetres} from './words.js';
 
 const RULER = 0.1; // m, nominal length of the board's ruler line
@@ -23,10 +23,7 @@ export class ScaleStep {
   }
 
   what() {
-    return (
-      'Tell the page how large things are: with ' +
-      'the printed board in the photograph, or with four points whose places you know.'
-    );
+    return 'Give the page a scale: the printed board in the photograph, or four points whose places you know.';
   }
 
   missing() {
@@ -66,7 +63,7 @@ export class ScaleStep {
         this.#choice('board', kind, 'The printed board lies in it'),
         this.#choice('points', kind, 'Four or more points whose places I know'),
         others.length
-          ? this.#choice('same', kind, 'The camera stood where it stood for another photograph')
+          ? this.#choice('same', kind, 'The camera did not move since another photograph')
           : null,
       ),
       kind === 'board' ? this.#board(photograph) : null,
@@ -131,11 +128,9 @@ export class ScaleStep {
       h(
         'p.note',
         {},
-        'Print it in its full size (100 %), and lay it flat on the table: ',
-        h('a', {href: 'api/board/a4.pdf', download: true}, 'board for A4'),
-        ', ',
-        h('a', {href: 'api/board/letter.pdf', download: true}, 'board for Letter'),
-        ' (PDF).',
+        'Print the ',
+        boards(),
+        ' in its full size (100 %), and lay it flat on the table.',
       ),
       numeric({
         label: 'Length of its ruler line, as you measure it',
@@ -154,24 +149,20 @@ export class ScaleStep {
     if (!seen) return null;
     if (seen.scale_problem) return h('p.problem', {}, seen.scale_problem);
     if (!seen.scale) return null;
-    const {residual, notes, board} = seen.scale;
+    const {residual, warnings} = seen.scale;
     return h(
       'div.outcome',
       {class: residual > POOR ? 'weak' : 'good'},
       h(
         'p',
         {},
-        h(
-          'strong',
-          {},
-          `The scale is known${board ? ` (board for ${board === 'a4' ? 'A4' : 'Letter'})` : ''}. `,
-        ),
-        `Its points fit each other to ${millimetres(residual, 2)}. `,
+        h('strong', {}, 'The scale is known. '),
+        `Its points fit to ${millimetres(residual, 2)}. `,
         residual > POOR
-          ? 'That is much: check the points.'
-          : 'Look whether the grid lies flat on the table in the photograph.',
+          ? 'That is a large error: check the points.'
+          : 'Check that the grid lies flat on the table in the photograph.',
       ),
-      notes.map((text) => h('p.note', {}, text)),
+      warnings.map((text) => h('p.note', {}, text)),
     );
   }
 
@@ -187,7 +178,7 @@ export class ScaleStep {
         {},
         lens
           ? `The calibration ${lens} is used for all photographs.`
-          : 'Without it, straight lines should look straight. With a camera calibrated in ROS, give its YAML file.',
+          : 'Straight lines that look bent need a correction: give the YAML file of a ROS camera calibration.',
       ),
       h(
         'div.row',
@@ -206,13 +197,13 @@ export class ScaleStep {
 
   drawn() {
     const {seen, photograph} = this.app;
-    const grid = (seen.scale?.grid ?? []).map((one, k) => {
-      const [u, v] = one.pixels[Math.floor(one.pixels.length / 2)];
+    const grid = (seen.scale?.grid ?? []).map(({pixels, label}, k) => {
+      const [u, v] = pixels[Math.floor(pixels.length / 2)];
       return h(
         'g',
         {key: `grid${k}`},
-        line(one.pixels, 'grid'),
-        h('g.label', {'data-u': u, 'data-v': v}, h('text', {x: 4, y: -4}, one.label)),
+        line(pixels, 'grid'),
+        h('g.label', {'data-u': u, 'data-v': v}, h('text', {x: 4, y: -4}, label)),
       );
     });
     const points = this.clicks() ? this.#points.marks(photograph) : [];
@@ -244,7 +235,7 @@ export class ScaleStep {
     const {id} = this.app;
     this.app.project.edit(
       (now) => {
-        now.photographs.find((one) => one.id === id).scale = scale;
+        now.photographs.find((photograph) => photograph.id === id).scale = scale;
       },
       {merge, place: PLACE},
     );
@@ -258,13 +249,14 @@ export class ScaleStep {
       this.app
         .used(false)
         .filter(([, role]) => role.endsWith('side'))
-        .map(([, , one]) => one),
+        .map(([, , side]) => side),
     );
     this.app.project.edit(
       (now) => {
-        for (const one of now.photographs) {
-          if (one.id === source || one.id === id || (scale.kind !== 'board' && sides.has(one.id))) continue;
-          one.scale = scale.kind === 'board' ? structuredClone(scale) : {kind: 'same', photograph: source};
+        for (const other of now.photographs) {
+          if (other.id === source || other.id === id || (scale.kind !== 'board' && sides.has(other.id)))
+            continue;
+          other.scale = scale.kind === 'board' ? structuredClone(scale) : {kind: 'same', photograph: source};
         }
       },
       {place: PLACE},

@@ -17,9 +17,9 @@ export class TraceStep {
   title = 'DLO';
   sides = true;
   showStart = true;
-  question = null; // number of the crossing that is asked about, where the person chose it
-  later = new Set(); // crossings that the person does not answer now: `photograph number`
-  strand = null; // that is pointed at in the question
+  question = null; // number of the crossing that the person chose to answer
+  later = new Set(); // crossings to be answered later: `photograph number`
+  strand = null; // under the pointer in the question
 
   constructor(app) {
     this.app = app;
@@ -58,11 +58,11 @@ export class TraceStep {
   }
 
   #open(id) {
-    return (this.app.project.seen(id)?.trace?.crossings ?? []).filter((one) => !one.answered);
+    return (this.app.project.seen(id)?.trace?.crossings ?? []).filter((crossing) => !crossing.answered);
   }
 
   get #start() {
-    // the start's trace, to be laid over the goal's photograph
+    // the start's trace, drawn over the goal's photograph
     const {app} = this;
     const other =
       app.role === 'goal' ? app.entry.start : app.role === 'goal_side' ? app.entry.start_side : null;
@@ -105,7 +105,7 @@ export class TraceStep {
       h(
         'details',
         {key: 'keys'},
-        h('summary', {}, 'How to mend the line'),
+        h('summary', {}, 'How to correct the line'),
         h(
           'ul.note',
           {},
@@ -126,7 +126,7 @@ export class TraceStep {
     if (!clicks.length) return h('p', {}, 'No clicks yet. Begin at one end of the DLO.');
     if (!seen?.trace) return h('p', {}, 'Go on: click the next bend, or the other end.');
     const {trace} = seen;
-    const unsure = trace.sure.filter((one) => !one).length / trace.sure.length;
+    const unsure = trace.sure.filter((sure) => !sure).length / trace.sure.length;
     return h(
       'div.outcome',
       {class: unsure > 0.02 ? 'weak' : 'good'},
@@ -147,7 +147,7 @@ export class TraceStep {
         ? h(
             'p',
             {},
-            `${Math.round(100 * unsure)} % of the line is not sure (dashed): look there, and click on the DLO where the line leaves it.`,
+            `${Math.round(100 * unsure)} % of the line is not sure (dashed): check it, and click on the DLO where the line leaves it.`,
           )
         : null,
     );
@@ -163,8 +163,8 @@ export class TraceStep {
         ? h('polyline.hit', {key: 'hit', 'data-mark': 'line', points: points(seen.trace.pixels)})
         : null,
       ...traced(seen.trace),
-      ...(seen.trace?.crossings ?? []).map((one, k) =>
-        crossingDrawn(seen.trace, one, k, this.asked() === k ? this.strand : null, this.asked() === k),
+      ...(seen.trace?.crossings ?? []).map((crossing, k) =>
+        crossingDrawn(seen.trace, crossing, k, this.asked() === k ? this.strand : null, this.asked() === k),
       ),
       ...photograph.clicks.map((at, k) =>
         mark({
@@ -182,7 +182,7 @@ export class TraceStep {
   asked() {
     const crossings = this.app.seen?.trace?.crossings ?? [];
     if (this.question !== null && crossings[this.question]) return this.question;
-    const k = crossings.findIndex((one, i) => !one.answered && !this.later.has(`${this.app.id} ${i}`));
+    const k = crossings.findIndex((crossing, i) => !crossing.answered && !this.later.has(`${this.app.id} ${i}`));
     return k < 0 || this.held ? null : k;
   }
 
@@ -200,9 +200,9 @@ export class TraceStep {
     this.strand = null;
     app.project.edit(
       (now) => {
-        const one = now.photographs.find((other) => other.id === app.id);
-        one.crossings = [
-          ...one.crossings.filter((other) => distance(other.pixel, pixel) > 3 * trace.width),
+        const photograph = now.photographs.find((other) => other.id === app.id);
+        photograph.crossings = [
+          ...photograph.crossings.filter((other) => distance(other.pixel, pixel) > 3 * trace.width),
           {pixel, first_above: first},
         ];
       },
@@ -214,15 +214,15 @@ export class TraceStep {
   /** Show the first crossing without an answer. */
   ask() {
     const {app} = this;
-    const found = [
+    const open = [
       [app.trial, 'start'],
       [app.trial, 'goal'],
     ].find(([k, role]) => this.#open(app.project.document.trials[k][role]).length);
     app.go(2);
-    if (!found) return;
-    app.choose(...found);
+    if (!open) return;
+    app.choose(...open);
     this.later.clear();
-    this.question = app.seen.trace.crossings.findIndex((one) => !one.answered);
+    this.question = app.seen.trace.crossings.findIndex((crossing) => !crossing.answered);
     requestAnimationFrame(() => app.view.reveal(app.seen.trace.crossings[this.question].pixel));
   }
 
@@ -230,9 +230,9 @@ export class TraceStep {
   reverse(id) {
     this.app.project.edit(
       (now) => {
-        const one = now.photographs.find((other) => other.id === id);
-        one.clicks.reverse();
-        for (const answer of one.crossings) answer.first_above = !answer.first_above;
+        const photograph = now.photographs.find((other) => other.id === id);
+        photograph.clicks.reverse();
+        for (const answer of photograph.crossings) answer.first_above = !answer.first_above;
       },
       {place: PLACE},
     );
@@ -264,7 +264,7 @@ export class TraceStep {
       move: (at) => {
         this.held = true;
         if (!inserted) insert(pixel);
-        this.#set((clicks) => clicks.map((one, i) => (i === k ? at : one)), merge);
+        this.#set((clicks) => clicks.map((click, i) => (i === k ? at : click)), merge);
       },
       end: () => {
         this.held = false;
@@ -301,7 +301,7 @@ export class TraceStep {
       return true;
     }
     if (!name.startsWith('click') || (key !== 'Delete' && key !== 'Backspace')) return false;
-    this.#set((clicks) => clicks.filter((one, i) => i !== k));
+    this.#set((clicks) => clicks.filter((click, i) => i !== k));
     const next = Math.min(k, this.app.photograph.clicks.length - 1);
     requestAnimationFrame(() =>
       requestAnimationFrame(() =>
@@ -319,8 +319,8 @@ export class TraceStep {
     const {pixels} = seen.trace;
     const places = placesOf(pixels, photograph.clicks);
     const {at} = nearest(pixels, pixel);
-    const found = places.findIndex((place) => place > at);
-    const k = found < 0 ? places.length : Math.max(found, at < places[0] ? 0 : 1);
+    const next = places.findIndex((place) => place > at);
+    const k = next < 0 ? places.length : Math.max(next, at < places[0] ? 0 : 1);
     this.#set((clicks) => [...clicks.slice(0, k), pixel, ...clicks.slice(k)], merge);
     return k;
   }
@@ -329,8 +329,8 @@ export class TraceStep {
     const {id} = this.app;
     this.app.project.edit(
       (now) => {
-        const one = now.photographs.find((other) => other.id === id);
-        one.clicks = change(one.clicks);
+        const photograph = now.photographs.find((other) => other.id === id);
+        photograph.clicks = change(photograph.clicks);
       },
       {merge, place: PLACE},
     );
@@ -344,7 +344,7 @@ export class TraceStep {
         [
           ['mark click', 'your click'],
           seen.trace ? ['sure', 'the DLO’s middle'] : null,
-          seen.trace?.sure.includes(false) ? ['unsure', 'not sure: look there'] : null,
+          seen.trace?.sure.includes(false) ? ['unsure', 'not sure: check it'] : null,
           this.#start?.trace && this.showStart ? ['before', 'where it lay at the start'] : null,
         ].filter(Boolean),
       ),

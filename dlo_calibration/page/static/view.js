@@ -2,7 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 
 /**
- * The view of a photograph: zoom, panning, and what is drawn over it.
+ * The view of a photograph: zoom, panning, and the drawing over it.
  *
  * Pixels are counted as everywhere in the package: u to the right and v down from the middle of the upper left one.
  */
@@ -100,9 +100,9 @@ export class View {
   pan(x, y) {
     if (!this.#size) return;
     const {width, height} = this.room;
-    const kept = 40;
-    this.left = Math.min(width - kept, Math.max(kept - this.scale * this.#size.width, this.left + x));
-    this.top = Math.min(height - kept, Math.max(kept - this.scale * this.#size.height, this.top + y));
+    const margin = 40;
+    this.left = Math.min(width - margin, Math.max(margin - this.scale * this.#size.width, this.left + x));
+    this.top = Math.min(height - margin, Math.max(margin - this.scale * this.#size.height, this.top + y));
     this.fitted = false;
     this.#apply();
   }
@@ -189,12 +189,12 @@ export class View {
       const {u, v} = mark.dataset;
       mark.setAttribute('transform', `translate(${u} ${v}) scale(${1 / this.scale})`);
     }
-    const kept = [];
+    const labels = [];
     for (const label of this.group.querySelectorAll('.label')) {
       const [x, y] = this.place([Number(label.dataset.u), Number(label.dataset.v)]);
-      const hides = kept.some(([u, v]) => Math.abs(u - x) < LABEL[0] && Math.abs(v - y) < LABEL[1]);
+      const hides = labels.some(([u, v]) => Math.abs(u - x) < LABEL[0] && Math.abs(v - y) < LABEL[1]);
       label.setAttribute('visibility', hides ? 'hidden' : 'visible');
-      if (!hides) kept.push([x, y]);
+      if (!hides) labels.push([x, y]);
     }
     const {width, height} = this.room;
     for (const bubble of this.layer.children) {

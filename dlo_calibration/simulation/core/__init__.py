@@ -4,8 +4,8 @@
 """
 The core, in C++: simulates whole trials, four at a time, without Python's lock.
 
-`roll_out` is its face; `Rope` is for engines that take the steps themselves.  Each physical term is one
-header and one line of `step.hpp`.  `_core.pyi` documents what Python sees.
+`roll_out` simulates trials; `Rope` is for engines that take the steps themselves.  Each physical term is one
+header and one line of `step.hpp`.  `_core.pyi` documents the interface.
 """
 
 from dlo_calibration.simulation.core._core import Event, Grip, roll_out, Rope, Script, Start, Stop, TARGETS

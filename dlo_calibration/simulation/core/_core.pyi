@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What Python sees of the core.  Wrong shapes, indices and numbers that are not finite raise ValueError."""
+"""The core's Python interface.  Wrong shapes, indices and numbers that are not finite raise ValueError."""
 
 from typing import Any, Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-#: the kinds of processors whose code this one can execute, the fastest first; all give the same bits
+#: kinds of processors whose code this processor can execute, the fastest first; all give the same bits
 TARGETS: tuple[str, ...]
 
 class Start:
@@ -27,9 +27,9 @@ class Start:
 
 class Grip:
     """
-    What a hand does while steps are taken; after the last of the k poses, it stays.
+    The poses of a hand while steps are taken; after the last of the k poses, it stays.
 
-    :param rows: of the table of offsets, one for each node that it holds.
+    :param rows: of the table of offsets, one per node that it holds.
     :param positions: (k, 3) [m] of the hand after each step.
     :param rotations: (k, 9) of the hand since it closed, matrices row by row; None: it does not turn.
     :param turns: (k, 9) rotations in each step.
@@ -46,8 +46,8 @@ class Event:
         """
         Close a hand at a position (3,) [m].
 
-        Its nodes keep their offsets from it from now on, as rows of a table, from `row` on; no row before may
-        be left out.
+        From now on, its nodes keep their offsets from it, which are rows of a table, from `row` on.  The
+        table has no gaps.
         """
 
     @staticmethod
@@ -60,14 +60,14 @@ class Event:
         """
         Take steps.
 
-        :param grips: what each closed hand does meanwhile, in the order of the held nodes.
-        :param count: number of steps; with `settles`, the most.
-        :param settles: they end as soon as the DLO is stable; if it is, and nothing has happened since, none
-            is taken.
-        :param remembers: the points before are kept, see `see`.
-        :param sights: (steps, share) for each goal meanwhile: it is seen so far (0 to 1) on the way to the
-            points after so many steps, from those before the last of them; before the first step, from those
-            that are remembered.  Those before the last step are remembered.
+        :param grips: the poses of each closed hand, in the order of the held nodes.
+        :param count: number of steps; with `settles`, the limit.
+        :param settles: the steps end as soon as the DLO is stable; no step is taken if it already is, and no
+            event has come since.
+        :param remembers: the points before the first step are remembered for `see`.
+        :param sights: (steps, share) for each goal in this time: the DLO is seen at the share (0 to 1) of the
+            way from the points before the last of these steps to those after it.  With 0 steps, the way
+            begins at the remembered points.  The points before the last step are remembered.
         """
 
     @staticmethod
@@ -75,22 +75,22 @@ class Event:
         """
         See the DLO at the next goal.
 
-        :param share: so far (0 to 1) on the way from the points that are remembered to those now; None: now,
-            and the goal is a stable configuration.
+        :param share: (0 to 1) of the way from the remembered points to the current ones; None: the current
+            points, and the goal is a stable configuration.
         """
 
 class Script:
     """
-    What happens in a trial; it does not depend on the parameters.
+    The events of a trial; they do not depend on the parameters.
 
-    :param stable_distance: the DLO is stable when no node moves as far [m]
-    :param stable_steps: within so many steps, at least 5.
+    :param stable_distance: the DLO is stable when no node moves as far as this [m] within `stable_steps`.
+    :param stable_steps: at least 5.
     """
 
     def __init__(self, events: Sequence[Event], stable_distance: float, stable_steps: int) -> None: ...
 
 class Stop:
-    """A flag that one thread sets, and that ends `roll_out` in others within some milliseconds."""
+    """A flag that one thread sets to end `roll_out` in others within some milliseconds."""
 
     def set(self) -> None: ...
     def is_set(self) -> bool: ...
@@ -99,19 +99,20 @@ def roll_out(jobs: Sequence[tuple[Script, Start, Mapping[str, float], float]], t
              stop: Stop | None = None, target: str = ''
              ) -> list[tuple[NDArray[np.float64], tuple[bool, ...], int] | None]:
     """
-    Simulate jobs; any number of threads may call it.  An outcome does not depend on the other jobs.
+    Simulate jobs.  Any number of threads may call this; an outcome does not depend on the other jobs.
 
     :param jobs: script, start, physical parameters by name (SI units), and the height [m] of nodes that touch
         the table.
     :param time_step: [s].
     :param target: one of `TARGETS`; empty: the fastest.
-    :returns: for each job the nodes at the goals (g, N, 3) [m], whether each goal was stable if it had to be,
-        and the number of steps; None where the rollout diverged.  After a stop, outcomes mean nothing.
+    :returns: for each job the nodes at the goals (g, N, 3) [m], whether the DLO was stable at each goal that
+        is a stable configuration (else True), and the number of steps; None if the rollout diverged.  After
+        a stop, outcomes are meaningless.
     """
 
 class Rope:
     """
-    A DLO whose steps are taken from Python.
+    A DLO that is stepped from Python.
 
     :param physical: parameters by name (SI units).
     :param time_step: [s].
@@ -119,22 +120,20 @@ class Rope:
     :param gravity: (3,) [m/s^2].
     """
 
-    #: (N, 3) [m], [m/s]: state; `predicted`: velocities without contact with others; `support`: how contact
-    #: changed the velocities in the last step.  They share their memory with the rope.
+    #: (N, 3) [m], [m/s]: state; `predicted`: velocities without contact with other bodies; `support`: change
+    #: of the velocities by that contact in the last step.  These arrays share their memory with the rope.
     points: NDArray[np.float64]
     velocities: NDArray[np.float64]
     predicted: NDArray[np.float64]
     support: NDArray[np.float64]
-    #: (N,) [1/kg] in contact with itself, 0 for held nodes; shared, too
-    inverse_masses: NDArray[np.float64]
     #: (N,) [kg]
     masses: NDArray[np.float64]
-    #: the nodes that are held
+    #: held nodes
     held: list[int]
-    #: (h, 3) [m] where they are after the coming step; a copy
+    #: (h, 3) [m] positions of the held nodes after the coming step; a copy
     targets: NDArray[np.float64]
-    #: copies of what else determines a step, by the names that the headers explain, for tests; `clamps` are
-    #: pairs of a segment and a unit vector (3,) of the material frame there
+    #: for tests: copies of what else determines a step, by the names in the headers; `clamps` are pairs of a
+    #: segment and a unit vector (3,) of the material frame there
     state: dict[str, Any]
 
     def __init__(self, start: Start, physical: Mapping[str, float], time_step: float, level: float,
@@ -144,7 +143,7 @@ class Rope:
 
     def aim(self, targets: ArrayLike, turns: ArrayLike | None = None) -> None:
         """
-        Set where held nodes are after the coming step.
+        Set the positions of held nodes after the coming step.
 
         :param targets: (h, 3) [m].
         :param turns: (h, 9) rotations of their hands in that step, row by row; None: a clamp turns with its
@@ -152,18 +151,15 @@ class Rope:
         """
 
     def predict(self) -> bool:
-        """Find `predicted`; tell whether it is finite."""
+        """Compute `predicted`; return whether it is finite."""
 
     def step(self) -> bool:
-        """Take a step on the table; tell whether the rope is still finite."""
-
-    def touch(self) -> None:
-        """Let self-contact change `predicted` as in a step, for tests."""
+        """Take a step on the table; return whether the rope is still finite."""
 
     def follow(self, script: Script, step: Callable[[], Any]
                ) -> tuple[NDArray[np.float64], tuple[bool, ...], int] | None:
         """
-        Follow a script; return its outcome as `roll_out` does.
+        Follow a script; return the outcome as `roll_out` does.
 
         :param step: takes a step to the targets that the script has set; it may not hold or aim.
         """

@@ -1,11 +1,11 @@
 // SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 // SPDX-License-Identifier: Apache-2.0
-// Arithmetic: the same source computes with doubles and with lanes, for one kind of processor.
+// Arithmetic: the same source computes with doubles and with lanes, for one target.
 //
-// A function that two kinds of processors shared would be linked once, for either of them.  So all that is
-// compiled for each is in the namespace `DLO_TARGET`.  Where lanes take different branches, both are computed
-// and `select` chooses, inside `if (any(...))`, so that a lone DLO skips what it does not need.  No lane
-// depends on another one: each has the bits that its DLO has alone.
+// Code for each target is in a namespace of its own, `DLO_TARGET`: the linker would keep only one copy of a
+// function that two targets share.  Where lanes take different branches, both are computed and `select`
+// chooses, inside `if (any(...))`, so that a lone DLO skips what it does not need.  No lane depends on another
+// lane: each has the bits that its DLO has alone.
 
 #include <cmath>
 
@@ -33,7 +33,7 @@ struct alignas(32) Mask {
   Bits of[kParts];
 };
 
-// The parts one after the other, not in a loop: g++ keeps a number in registers only then.
+// The parts are not in a loop, because g++ would not keep the number in registers.
 #define DLO_PART(number, expression) \
   if constexpr (number < kParts) { constexpr int k = number; result.of[k] = expression; }
 #define DLO_LANEWISE(Result, expression)          \
@@ -83,12 +83,14 @@ inline auto max(A a, B b) { return select(b > a, b, a); }
 
 inline double sqrt(double x) { return __builtin_sqrt(x); }
 inline Vector sqrt(Vector x) {
+#ifdef __clang__
+  return __builtin_elementwise_sqrt(x);
+#else
   for (int k = 0; k < kWidth; ++k) x[k] = __builtin_sqrt(x[k]);  // one instruction
   return x;
+#endif
 }
 inline Lanes sqrt(Lanes a) { DLO_LANEWISE(Lanes, sqrt(a.of[k])); }
-
-
 
 template <class Number>
 inline Number abs(Number x) { return select(x < 0.0, -x, x); }
@@ -121,14 +123,15 @@ inline Point operator*(const Matrix& m, const Point& p) {
           m[6] * p.x + m[7] * p.y + m[8] * p.z};
 }
 
-// Angles.  Those of the C library differ in their last bit from processor to processor; these, made of sums
-// and products alone, do not.  Errors are below 3e-16 rad or 3e-16 (Taylor series of the reduced argument).
+// Angles.  The functions of the C library differ in their last bit from processor to processor; these use only
+// sums, products, quotients and roots, and do not.  Errors are below 3e-16 (Taylor series of the reduced
+// argument).
 
 struct Rotation {
   double cosine, sine;
 };
 
-/// Cosine and sine of an angle [rad] that is below a hundred thousand turns.
+/// Cosine and sine of an angle [rad] of less than a hundred thousand turns.
 inline Rotation rotation(double angle) {
   // pi / 2 as a sum; the first part has 33 bits, so that its multiples are exact.
   constexpr double kQuarter = 1.5707963267341256, kRest = 6.077100506506192e-11;
@@ -147,7 +150,7 @@ inline Rotation rotation(double angle) {
   }
 }
 
-/// The angle [rad] from -pi to pi of a vector; 0 for none.
+/// The angle [rad] of a vector, from -pi to pi; 0 for the zero vector.
 inline double angle_of(double y, double x) {
   constexpr double kQuarter = 1.5707963267948966;
   const double a = abs(x), b = abs(y);

@@ -2,14 +2,14 @@
 // SPDX-License-Identifier: Apache-2.0
 // The material frame: natural curvature and twist.
 //
-// Each segment has a material frame, turned by an angle from a frame that is carried along without twist
-// (Bergou et al., Discrete Elastic Rods, 2008; Bishop, There is more than one way to frame a curve, 1975).
-// With natural curvature k, two components in the material frame, the bending energy becomes
-// EI / (2 l) |t_i - t_(i-1) - l k_i|^2: beside the energy of a straight DLO and a constant, there is a mixed
-// term, -EI k_i . (t_i - t_(i-1)), where k_i has the mean angle of both segments.  The twisting energy is
-// GJ / (2 l) (angle_i - angle_(i-1))^2.  A DLO has almost no inertia about its axis, so that the angles are
-// those of least energy: a clamp prescribes them, free ends and pins are without torque.  Where clamps do not
-// hold the DLO (torsion 0), it turns freely as a whole, and does not twist.
+// Each segment has a material frame, turned by an angle from the Bishop frame, which has no twist (Bergou et
+// al., Discrete Elastic Rods, 2008; Bishop, There is more than one way to frame a curve, 1975).  With natural
+// curvature k, two components in the material frame, the bending energy becomes
+// EI / (2 l) |t_i - t_(i-1) - l k_i|^2.  This is the energy of a straight DLO, a constant, and a mixed term,
+// -EI k_i . (t_i - t_(i-1)), where k_i has the mean angle of both segments.  The twisting energy is
+// GJ / (2 l) (angle_i - angle_(i-1))^2.  A DLO has almost no inertia about its axis, so that its angles
+// minimise the energy: a clamp prescribes them, free ends and pins bear no torque.  With torsion 0, clamps do
+// not prescribe them: the DLO turns freely as a whole and does not twist.
 
 namespace dlo {
 namespace DLO_TARGET {
@@ -17,15 +17,17 @@ namespace DLO_TARGET {
 constexpr double kTwoPi = 6.283185307179586;
 constexpr double kRounded = 0.05;  // rad; mean bend below which the energy of curvature is rounded off
 constexpr double kSteady = 0.01;   // rad; where bends are smaller, natural curvature turns the frame slowly
-constexpr double kReach = 0.2;     // rad; most that the material frame turns in a step
-constexpr int kFirstTurns = 30;    // iterations for the angles at the start; later, one in each step does
+constexpr double kReach = 0.2;     // rad; largest turn of the material frame in a step
+constexpr int kFirstTurns = 30;    // Newton steps at the start; later, one in each time step is enough
 
-/// Transport `across` from the tangent `before` to another by the smallest rotation.
-inline Point transported(Point across, const Point& before, const Point& tangent) {
-  const double share = dot(across, tangent) / max(1.0 + dot(before, tangent), 2 * kHairpin);
+/// Transport `across` in parallel: by the smallest rotation that turns the tangent `before` to `tangent`.
+template <class Number>
+inline Vec3<Number> transported(Vec3<Number> across, const Vec3<Number>& before,
+                                const Vec3<Number>& tangent) {
+  const Number share = dot(across, tangent) / max(1.0 + dot(before, tangent), 2 * kHairpin);
   across = across - share * (before + tangent);
   across = across - dot(across, tangent) * tangent;  // zero except in a hairpin
-  const double length = sqrt(dot(across, across));
+  const Number length = sqrt(dot(across, across));
   return {across.x / length, across.y / length, across.z / length};
 }
 
@@ -35,31 +37,27 @@ inline Point perpendicular(const Point& t) {
   int least = 0;
   for (int c = 1; c < 3; ++c)
     if (abs(t_[c]) < abs(t_[least])) least = c;
-  const int one = (least + 1) % 3, two = (least + 2) % 3;
-  const double length = sqrt(t_[one] * t_[one] + t_[two] * t_[two]);
-  double found[3] = {};
-  found[one] = t_[two] / length, found[two] = -t_[one] / length;
-  return {found[0], found[1], found[2]};
+  const int second = (least + 1) % 3, third = (least + 2) % 3;
+  const double length = sqrt(t_[second] * t_[second] + t_[third] * t_[third]);
+  double result[3] = {};
+  result[second] = t_[third] / length, result[third] = -t_[second] / length;
+  return {result[0], result[1], result[2]};
 }
 
-/// Carry a frame along the DLO without twist, from where it was at the first segment in the last step; write
-/// the bends between segments in this frame.
+/// Compute the Bishop frame, transported in time at the first segment and from there along the DLO, and the
+/// bends between segments in it.
 template <class Number>
-inline void carry_along(Rods<Number>& rods, bool begun) {
+inline void find_bishop_frame(Rods<Number>& rods, bool begun) {
   auto* all_joints = rods.joints.data();
   const int joints = rods.nodes - 2;
   auto *tangents = rods.tangents.data(), *across = rods.across.data();
-  for (int lane = 0; lane < lanes_of<Number>; ++lane) {
-    const Point tangent = in_lane(tangents[0], lane);
-    const Point first = begun ? transported(in_lane(rods.carried[1], lane),
-                                            in_lane(rods.carried[0], lane), tangent)
-                              : perpendicular(tangent);
-    set_lane(rods.carried[0], lane, tangent), set_lane(rods.carried[1], lane, first);
-  }
-  across[0] = rods.carried[1];
+  if (begun) rods.bishop[1] = transported(rods.bishop[1], rods.bishop[0], tangents[0]);
+  else if constexpr (lanes_of<Number> == 1) rods.bishop[1] = perpendicular(tangents[0]);
+  rods.bishop[0] = tangents[0];
+  across[0] = rods.bishop[1];
   for (int i = 0; i < joints; ++i) {
-    const Vec3<Number>&a = tangents[i], &b = tangents[i + 1];
-    Vec3<Number> u = across[i];
+    const Vec3<Number>&a = tangents[i], &b = tangents[i + 1], &u = across[i];
+    Vec3<Number>& next = across[i + 1];
     Number square = (1.0 + a.x * b.x + a.y * b.y + a.z * b.z) / 2;
     const auto hairpin = square < kHairpin;
     if (any(hairpin)) square = select(hairpin, kHairpin, square);
@@ -67,16 +65,16 @@ inline void carry_along(Rods<Number>& rods, bool begun) {
     const Number x = dot(b, u) * inverse, y = dot(u, cross(b, a)) * inverse;
     Joint<Number>& joint = all_joints[i];
     joint.x = x, joint.y = y, joint.inverse = inverse, joint.half = inverse * square;
-    u = u - x * (inverse / 2) * (a + b);
-    if (any(hairpin)) {  // that was not quite a rotation
-      const Vec3<Number> v = u - dot(u, b) * b, unit = 1.0 / sqrt(dot(v, v)) * v;
-      u = {select(hairpin, unit.x, u.x), select(hairpin, unit.y, u.y), select(hairpin, unit.z, u.z)};
+    next = u - x * (inverse / 2) * (a + b);
+    if (any(hairpin)) {  // the line above was not quite a rotation
+      const Vec3<Number> v = next - dot(next, b) * b, unit = 1.0 / sqrt(dot(v, v)) * v;
+      next = {select(hairpin, unit.x, next.x), select(hairpin, unit.y, next.y),
+              select(hairpin, unit.z, next.z)};
     }
-    across[i + 1] = u;
   }
 }
 
-/// The natural curvature in the carried frame.
+/// The natural curvature in the Bishop frame.
 template <class Number>
 inline std::array<Number, 2> turned(const Natural<Number>& natural, const Number& cosine,
                                     const Number& sine) {
@@ -86,19 +84,18 @@ inline std::array<Number, 2> turned(const Natural<Number>& natural, const Number
 /// The bends [N m] in the direction of the natural curvature and across: sums over all joints.
 template <class Number>
 inline std::array<Number, 2> mean_direction(const Rods<Number>& rods) {
-  Number one{}, two{};
+  Number along{}, across{};
   for (std::size_t i = 0; i < rods.joints.size(); ++i) {
     const auto &natural = rods.natural[i];
     const auto &joint = rods.joints[i];
-    one = one + (natural.x * joint.x + natural.y * joint.y);
-    two = two + (natural.x * joint.y - natural.y * joint.x);
+    along = along + (natural.x * joint.x + natural.y * joint.y);
+    across = across + (natural.x * joint.y - natural.y * joint.x);
   }
-  return {one, two};
+  return {along, across};
 }
 
-/// Turn the frame as a whole to the least energy, and find the twisting moments.  With a and b of
-/// `mean_direction`, the energy is -sqrt(a^2 + b^2).  It has a cusp where the DLO is straight; `kRounded`
-/// rounds it off.
+/// Turn the frame as a whole to the least energy, and compute the twisting moments.  With a and b of
+/// `mean_direction`, the energy is -sqrt(a^2 + b^2).  `kRounded` rounds off its cusp at a straight DLO.
 template <class Number>
 inline void turn_freely(Rods<Number>& rods) {
   const int joints = rods.nodes - 2;
@@ -120,14 +117,14 @@ inline void turn_freely(Rods<Number>& rods) {
   }
 }
 
-/// Find how far a segment must turn in a clamp; one that just closed keeps what it finds.
+/// The angle [rad] by which a clamp turns its segment; a clamp that just closed does not turn it.
 inline double turn_in(Clamp& clamp, const Point& t, const Point& u, double angle) {
   const Point v = cross(t, u);
   Point d = clamp.direction;
   if (!std::isfinite(d.x)) {
     const Rotation by = rotation(angle);
     d = by.cosine * u + by.sine * v;
-  } else if (std::isfinite(clamp.tangent.x)) {  // it goes with the segment, by the smallest rotation
+  } else if (std::isfinite(clamp.tangent.x)) {  // parallel transport with the segment
     const Point& b = clamp.tangent;
     const double share = dot(d, t) / max(1.0 + b.x * t.x + b.y * t.y + b.z * t.z, 2 * kHairpin);
     d = d - share * (b + t);
@@ -146,51 +143,51 @@ inline void turn_clamps(Rope& rope) {
   }
 }
 
-/// Cosine and sine of the sum of two angles, of which the first one's are given.
+/// Cosine and sine of the sum of two angles, from those of the first angle and the second angle [rad].
 template <class Number>
 inline std::array<Number, 2> added(const Number& cosine, const Number& sine, const Number& angle) {
   const Number q = angle * angle;
   Number c = 1 - q * (0.5 - q * (1.0 / 24)), s = angle * (1 - q * (1.0 / 6 - q * (1.0 / 120)));
   const auto large = abs(angle) > 0.01;
   if (any(large)) {
-    Number exact_c = c, exact_s = s, given = angle;
+    Number exact_c = c, exact_s = s, second = angle;
     for (int lane = 0; lane < lanes_of<Number>; ++lane) {
-      const Rotation by = rotation(in_lane(given, lane));
+      const Rotation by = rotation(in_lane(second, lane));
       in_lane(exact_c, lane) = by.cosine, in_lane(exact_s, lane) = by.sine;
     }
     c = select(large, exact_c, c), s = select(large, exact_s, s);
   }
   const Number x = cosine * c - sine * s, y = sine * c + cosine * s;
-  const Number left = 1.5 - (x * x + y * y) / 2;  // so that rounding does not add up
-  return {left * x, left * y};
+  const Number scale = 1.5 - (x * x + y * y) / 2;  // so that rounding does not add up
+  return {scale * x, scale * y};
 }
 
 /// Turn the segments towards the balance of torques about their axes.
 ///
 /// The energy is that of twist plus -|A| cos(delta) of natural curvature at each joint, with delta the mean
 /// angle of both segments from the plane of the bend.  Where delta changes by less than `kReach`, a parabola
-/// with the curvature |A| (cos(delta) + kReach / 3) lies nowhere below, so that a Newton step of at most that
-/// size lowers the energy; where the matrix is not positive definite, its pivots are replaced (Nocedal and
+/// with the curvature |A| (cos(delta) + kReach / 3) is an upper bound, so that a Newton step of at most that
+/// size lowers the energy.  Pivots of a matrix that is not positive definite are replaced (Nocedal and
 /// Wright, Numerical Optimization, 2006, 3.4).
-/// `begun`: false: clamps of unknown direction do not hold yet.
+/// `begun`: if false, clamps of unknown direction do not hold yet.
 template <class Number>
 inline void balance_torques(Rods<Number>& rods, const Ropes& ropes, bool begun) {
   const int segments = rods.nodes - 1;
   const Number none{};
-  auto *given = rods.given.data(), *turning = rods.turning.data(), *upper = rods.upper.data();
+  auto *prescribed = rods.prescribed.data(), *turning = rods.turning.data(), *upper = rods.upper.data();
   auto *angles = rods.angles.data(), *clamped = rods.clamped.data();
   const auto* twisting = rods.twisting.data();
   const auto* natural = rods.natural.data();
   auto* joints = rods.joints.data();
-  const auto known = [&](const Clamp& clamp) { return begun || std::isfinite(clamp.direction.x); };
+  const auto holds = [&](const Clamp& clamp) { return begun || std::isfinite(clamp.direction.x); };
   for (int i = 0; i < segments; ++i) clamped[i] = none;
   for (std::size_t lane = 0; lane < ropes.size(); ++lane)
     for (Clamp& clamp : ropes[lane]->clamps)
-      if (known(clamp)) {
+      if (holds(clamp)) {
         const int i = clamp.segment;
         in_lane(clamped[i], lane) = 1.0;
-        in_lane(given[i], lane) = turn_in(clamp, in_lane(rods.tangents[i], lane),
-                                          in_lane(rods.across[i], lane), in_lane(angles[i], lane));
+        in_lane(prescribed[i], lane) = turn_in(clamp, in_lane(rods.tangents[i], lane),
+                                               in_lane(rods.across[i], lane), in_lane(angles[i], lane));
       }
   Number coupling = none, beyond = none, right = none, share = none, next_diagonal = none, next_right = none;
   for (int i = 0; i < segments; ++i) {
@@ -200,9 +197,9 @@ inline void balance_torques(Rods<Number>& rods, const Ropes& ropes, bool begun) 
     if (i < segments - 1) {
       const Joint<Number> joint = joints[i];
       const Number stiffness = twisting[i];
-      const auto [one, two] = turned(natural[i], joint.cosine, joint.sine);
-      const Number slope = (joint.x * two - joint.y * one) / 2;
-      const Number curved = (one * joint.x + two * joint.y +
+      const auto [x, y] = turned(natural[i], joint.cosine, joint.sine);
+      const Number slope = (joint.x * y - joint.y * x) / 2;
+      const Number curved = (x * joint.x + y * joint.y +
                              natural[i].size *
                                  (kReach / 3 * (abs(joint.x) + abs(joint.y)) + kSteady)) / 4;
       const Number torque = stiffness * (angles[i + 1] - angles[i]);
@@ -214,7 +211,7 @@ inline void balance_torques(Rods<Number>& rods, const Ropes& ropes, bool begun) 
     const Number beside = twisting[i > 0 ? i - 1 : 0];
     diagonal = select(diagonal < 1e-6 * beside, beside, diagonal);
     const auto held = clamped[i] > 0.0;
-    diagonal = select(held, 1.0, diagonal), right = select(held, given[i], right);
+    diagonal = select(held, 1.0, diagonal), right = select(held, prescribed[i], right);
     beyond = select(held, 0.0, coupling);
     const Number inverse = 1.0 / diagonal;
     share = coupling * inverse;
@@ -229,7 +226,7 @@ inline void balance_torques(Rods<Number>& rods, const Ropes& ropes, bool begun) 
   if (any(far)) {
     share = select(far, 2 * kReach / largest, 1.0);
     for (int i = 0; i < segments; ++i)
-      turning[i] = select(clamped[i] > 0.0, given[i], turning[i] * share);
+      turning[i] = select(clamped[i] > 0.0, prescribed[i], turning[i] * share);
   }
   for (int i = 0; i < segments; ++i) angles[i] = angles[i] + turning[i];
   for (int i = 0; i < segments - 1; ++i) {
@@ -240,12 +237,12 @@ inline void balance_torques(Rods<Number>& rods, const Ropes& ropes, bool begun) 
   }
 }
 
-/// Find the angles at the start: between clamps of known direction evenly twisted, else without twist.
+/// Compute the angles at the start: evenly twisted between clamps of known direction, else without twist.
 inline void begin_frame(Rods<double>& rods, const Ropes& ropes) {
   auto& angles = rods.angles;
   const int segments = static_cast<int>(angles.size());
-  const auto [one, two] = mean_direction(rods);
-  angles.assign(segments, angle_of(two, one));
+  const auto [along, across] = mean_direction(rods);
+  angles.assign(segments, angle_of(across, along));
   int last = -1;
   for (const Clamp& clamp : ropes[0]->clamps) {
     if (!std::isfinite(clamp.direction.x)) continue;
@@ -266,15 +263,15 @@ inline void begin_frame(Rods<double>& rods, const Ropes& ropes) {
   }
   for (int k = 0; k < kFirstTurns; ++k) balance_torques(rods, ropes, false);
 }
-inline void begin_frame(Rods<Lanes>&, const Ropes&) {}  // DLOs go on together from their second step on
+inline void begin_frame(Rods<Lanes>&, const Ropes&) {}  // never called: a rope's first step is taken alone
 
 /// Add the impulses [N s] of natural curvature and twist.
 ///
-/// The forces are the exact gradient of the energy, for segments that move without turning about their axes.
-/// A segment has no inertia about its axis, so that a couple of forces at its ends replaces the torque on it.
+/// The forces are the exact gradient of the energy of segments that do not turn about their axes.  A couple
+/// of forces at the ends of a segment replaces the torque on it.
 template <class Number>
 inline void add_frame(Rods<Number>& rods, const Ropes& ropes, bool begun) {
-  carry_along(rods, begun);
+  find_bishop_frame(rods, begun);
   if (!rods.twists) {
     turn_freely(rods);
   } else {
@@ -288,26 +285,25 @@ inline void add_frame(Rods<Number>& rods, const Ropes& ropes, bool begun) {
   const auto* natural = rods.natural.data();
   const auto* inverse_lengths = rods.inverse_lengths.data();
   auto* impulses = rods.frame_impulses.data();
-  impulses[0] = {};
-  Vec3<Number> torque{}, next{};  // [N m] on the segment and on the next one, turned by a right angle
-  for (int i = 0; i <= joints; ++i, torque = next) {
-    next = Vec3<Number>{};
-    if (i < joints) {
-      const Vec3<Number>&a = tangents[i], &b = tangents[i + 1], &u = across[i];
-      const Joint<Number>& joint = all_joints[i];
-      const auto [x, y] = turned(natural[i], joint.cosine, joint.sine);
-      const Number one = joint.half * x, two = joint.half * y;
-      const Vec3<Number> bend = one * u + two * cross(a, u);
-      const Number share = (one * joint.x + two * joint.y) * (joint.inverse / 2);
-      const Number twist = joint.twist * (joint.inverse * joint.inverse / 2);
-      const Vec3<Number> turn = twist * cross(a, b);
-      torque = torque - bend - turn;
-      next = bend - share * (a + b) - turn;
-    }
-    const Vec3<Number> impulse = step * inverse_lengths[i] * torque;
-    impulses[i] = impulses[i] - impulse;
-    impulses[i + 1] = impulse;
+  impulses[0].x = impulses[0].y = impulses[0].z = Number{};
+  Vec3<Number> torque{};  // [N m] on the segment, by the joint before it; turned by a right angle
+  const auto add_couple = [&](int i, const Vec3<Number>& whole) {
+    impulses[i + 1] = step * inverse_lengths[i] * whole;
+    impulses[i] = impulses[i] - impulses[i + 1];
+  };
+  for (int i = 0; i < joints; ++i) {
+    const Vec3<Number>&a = tangents[i], &b = tangents[i + 1], &u = across[i];
+    const Joint<Number>& joint = all_joints[i];
+    const auto [x, y] = turned(natural[i], joint.cosine, joint.sine);
+    const Number half_x = joint.half * x, half_y = joint.half * y;
+    const Vec3<Number> bend = half_x * u + half_y * cross(a, u);
+    const Number share = (half_x * joint.x + half_y * joint.y) * (joint.inverse / 2);
+    const Number twist = joint.twist * (joint.inverse * joint.inverse / 2);
+    const Vec3<Number> turn = twist * cross(a, b);
+    add_couple(i, torque - bend - turn);
+    torque = bend - share * (a + b) - turn;
   }
+  add_couple(joints, torque);
 }
 
 }  // namespace DLO_TARGET

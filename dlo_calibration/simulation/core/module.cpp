@@ -10,6 +10,7 @@
 #include <algorithm>
 #include <cmath>
 #include <optional>
+#include <sstream>
 
 #include "script.hpp"
 
@@ -21,31 +22,37 @@ namespace {
 
 using Array = py::array_t<double, py::array::c_style | py::array::forcecast>;
 constexpr std::size_t kMostNodes = 10000;  // the table of distances of segments grows with their square
-constexpr int kFewestStableSteps = 5, kMostStableSteps = 100000000;  // so many checks are made within them
+constexpr int kFewestStableSteps = 5, kMostStableSteps = 100000000;  // there are five checks within them
 
-void require(bool holds, const std::string& what) {
-  if (!holds) throw py::value_error(what);
+/// Raise a ValueError with a text, "thing: what came; expected what; remedy", unless a condition holds.
+template <class... Parts>
+void require(bool holds, const Parts&... parts) {
+  if (holds) return;
+  std::ostringstream text;
+  (text << ... << parts);
+  throw py::value_error(text.str());
 }
 
 void require_finite(const char* name, double number) {
-  require(std::isfinite(number), std::string(name) + ": got a number that is not finite");
+  require(std::isfinite(number), name, ": ", number, "; expected a finite number; replace it");
 }
 
 bool all_finite(const Array& array) {
   return std::all_of(array.data(), array.data() + array.size(), [](double x) { return std::isfinite(x); });
 }
 
-/// Rows of a kind that consists of numbers, from an array (n, ...) with as many numbers in each row.
+/// The rows of an array (n, ...); each has as many numbers as a `Row`.
 template <class Row>
 std::vector<Row> rows(const char* name, const Array& array, bool finite = true) {
   constexpr py::ssize_t kNumbers = sizeof(Row) / sizeof(double);
   const py::ssize_t n = array.ndim() ? array.shape(0) : 0;
-  require(array.size() == n * kNumbers, std::string(name) + ": got " + std::to_string(array.size()) +
-                                            " numbers, expected rows of " + std::to_string(kNumbers));
-  require(!finite || all_finite(array), std::string(name) + ": got a number that is not finite");
-  std::vector<Row> found(n);
-  std::copy_n(array.data(), array.size(), reinterpret_cast<double*>(found.data()));
-  return found;
+  require(array.size() == n * kNumbers, name, ": ", array.size(), " numbers in ", n, " rows; expected ",
+          kNumbers, " in each row; reshape the array");
+  require(!finite || all_finite(array), name,
+          ": a number that is not finite; expected finite ones; replace it");
+  std::vector<Row> result(n);
+  std::copy_n(array.data(), array.size(), reinterpret_cast<double*>(result.data()));
+  return result;
 }
 
 template <class Row>
@@ -54,12 +61,12 @@ std::vector<Row> rows(const char* name, const std::optional<Array>& array, bool 
 }
 
 Point point(const char* name, const Array& array) {
-  require(array.size() == 3, std::string(name) + ": got an array of another size than 3");
+  require(array.size() == 3, name, ": ", array.size(), " numbers; expected 3; give x, y and z");
   for (int c = 0; c < 3; ++c) require_finite(name, array.data()[c]);
   return {array.data()[0], array.data()[1], array.data()[2]};
 }
 
-/// Rows as an array (n, ...) of their numbers, which shares their memory with `owner`; without one, a copy.
+/// The array (n, ...) of the numbers of rows: a view into the memory of `owner`, or a copy without an owner.
 template <class Row>
 Array array_of(const std::vector<Row>& rows, const py::object& owner = {}) {
   constexpr py::ssize_t kNumbers = sizeof(Row) / sizeof(double);
@@ -73,108 +80,117 @@ Properties properties_of(const py::object& mapping) {
   try {
     physical = py::dict(mapping);
   } catch (const py::error_already_set&) {
-    throw py::type_error("physical: got no mapping");
+    throw py::type_error(
+        "physical: no mapping; expected numbers by parameter name, in SI units; pass a dict");
   }
   const auto get = [&](const std::string& name, double otherwise) {
     try {
       return physical.contains(name) ? physical[name.c_str()].cast<double>() : otherwise;
     } catch (const py::cast_error&) {
-      throw py::type_error(name + ": got no number");
+      throw py::type_error(name + ": no number; expected one in SI units; convert it");
     }
   };
   const auto need = [&](const std::string& name) {
     if (!physical.contains(name)) throw py::key_error(name);
     return get(name, 0.0);
   };
-  Properties found;
-  found.bending_stiffness = need("flexibility"), found.stretching_stiffness = need("elasticity");
-  found.mass = need("mass"), found.drag = need("damping");
-  found.internal_damping = need("internal_damping"), found.friction = need("friction");
-  found.radius = need("self_collision"), found.length_scale = get("length_scale", 1.0);
-  found.natural_curvature = get("natural_curvature", 0.0), found.marker_mass = get("marker_mass", 0.0);
-  found.torsion = get("torsion", 0.0), found.bending_friction = get("bending_friction", 0.0);
-  found.bending_slip = get("bending_slip", 0.1), found.clamp_twist = get("clamp_twist", 0.0);
+  Properties properties;
+  properties.bending_stiffness = need("flexibility"), properties.stretching_stiffness = need("elasticity");
+  properties.mass = need("mass"), properties.drag = need("damping");
+  properties.internal_damping = need("internal_damping"), properties.friction = need("friction");
+  properties.radius = need("self_collision"), properties.length_scale = get("length_scale", 1.0);
+  properties.natural_curvature = get("natural_curvature", 0.0);
+  properties.marker_mass = get("marker_mass", 0.0), properties.torsion = get("torsion", 0.0);
+  properties.bending_friction = get("bending_friction", 0.0);
+  properties.bending_slip = get("bending_slip", 0.1), properties.clamp_twist = get("clamp_twist", 0.0);
   for (int part = 2; physical.contains("stiffness_" + std::to_string(part)); ++part)
-    found.profile.push_back(need("stiffness_" + std::to_string(part)));
+    properties.profile.push_back(need("stiffness_" + std::to_string(part)));
   for (int knot = 1; physical.contains("rest_curvature_x" + std::to_string(knot)); ++knot)
-    found.rest_curvature.push_back({need("rest_curvature_x" + std::to_string(knot)),
-                                    need("rest_curvature_y" + std::to_string(knot))});
-  return found;
+    properties.rest_curvature.push_back({need("rest_curvature_x" + std::to_string(knot)),
+                                         need("rest_curvature_y" + std::to_string(knot))});
+  return properties;
 }
 
 Start make_start(const Array& places, const Array& points, const Array& velocities,
                  const std::optional<Array>& features, const std::optional<Array>& directions) {
-  Start found{rows<double>("places", places), rows<Point>("points", points),
+  Start start{rows<double>("places", places), rows<Point>("points", points),
               rows<Point>("velocities", velocities), rows<double>("features", features),
               rows<Point>("directions", directions, false)};
-  const std::size_t n = found.places.size();
-  require(n > 2 && n <= kMostNodes && found.points.size() == n && found.velocities.size() == n &&
-              (found.features.empty() || found.features.size() == n) &&
-              (found.directions.empty() || found.directions.size() == n - 1),
-          "start: got arrays of different lengths, fewer than 3 nodes, or more than " +
-              std::to_string(kMostNodes));
+  const std::size_t n = start.places.size();
+  require(n > 2 && n <= kMostNodes, "start: ", n, " nodes; expected 3 to ", kMostNodes,
+          "; choose another number of nodes");
+  require(start.points.size() == n && start.velocities.size() == n &&
+              (start.features.empty() || start.features.size() == n) &&
+              (start.directions.empty() || start.directions.size() == n - 1),
+          "start: arrays of different lengths; expected ", n, " rows, or ", n - 1,
+          " directions; give one row per node");
   for (std::size_t i = 1; i < n; ++i)
-    require(found.places[i] > found.places[i - 1], "places: got arc lengths that do not increase");
-  return found;
+    require(start.places[i] > start.places[i - 1], "places: ", start.places[i], " m after ",
+            start.places[i - 1], " m; expected arc lengths that increase; sort the nodes");
+  return start;
 }
 
 std::vector<int> checked_nodes(std::vector<int> nodes) {
   for (int node : nodes)
-    require(node >= 0 && node < static_cast<int>(kMostNodes), "nodes: got one below 0, or too large a one");
+    require(node >= 0 && node < static_cast<int>(kMostNodes), "nodes: ", node, "; expected 0 to ",
+            kMostNodes - 1, "; give the index of a node");
   return nodes;
 }
 
 Grip make_grip(std::vector<int> rows_, const Array& positions, const std::optional<Array>& rotations,
                const Array& turns) {
-  Grip found{std::move(rows_), rows<Point>("positions", positions), rows<Matrix>("rotations", rotations),
-             rows<Matrix>("turns", turns)};
-  const std::size_t steps = found.positions.size();
-  require(steps > 0 && found.turns.size() == steps &&
-              (found.rotations.empty() || found.rotations.size() == steps),
-          "grip: got arrays of different lengths, or none");
-  return found;
+  Grip grip{std::move(rows_), rows<Point>("positions", positions), rows<Matrix>("rotations", rotations),
+            rows<Matrix>("turns", turns)};
+  const std::size_t steps = grip.positions.size();
+  require(steps > 0 && grip.turns.size() == steps &&
+              (grip.rotations.empty() || grip.rotations.size() == steps),
+          "grip: ", steps, " positions, ", grip.rotations.size(), " rotations and ", grip.turns.size(),
+          " turns; expected the same number of each, at least 1; give one of each per step");
+  return grip;
 }
 
 Event make_close(int row, std::vector<int> nodes, const Array& position) {
-  require(row >= 0, "row: got a negative one");
+  require(row >= 0, "row: ", row, "; expected 0 or more; count the rows from 0");
   return {Close{row, checked_nodes(std::move(nodes)), point("position", position)}};
 }
 
 Event make_hold(std::vector<int> nodes) { return {Hold{checked_nodes(std::move(nodes))}}; }
 
 double require_share(double share) {
-  require(share >= 0.0 && share <= 1.0, "share: got none from 0 to 1");
+  require(share >= 0.0 && share <= 1.0, "share: ", share, "; expected 0 to 1; give a part of the step");
   return share;
 }
 
 Event make_advance(std::vector<std::shared_ptr<const Grip>> grips, int count, bool settles, bool remembers,
                    const std::vector<std::pair<int, double>>& sights) {
-  require(count > 0, "count: got no steps");
-  for (const auto& grip : grips) require(grip != nullptr, "grips: got None");
-  Advance found{std::move(grips), count, settles, remembers, {}};
+  require(count > 0, "count: ", count, " steps; expected 1 or more; leave the event out");
+  for (const auto& grip : grips) require(grip != nullptr, "grips: None; expected a Grip; leave it out");
+  Advance advance{std::move(grips), count, settles, remembers, {}};
   for (const auto& [after, share] : sights) {
-    require(after >= (found.sights.empty() ? 0 : found.sights.back().after) && after <= count,
-            "sights: got some out of order, or after the last step");
-    found.sights.push_back({after, require_share(share)});
+    const int earliest = advance.sights.empty() ? 0 : advance.sights.back().after;
+    require(after >= earliest && after <= count, "sights: a goal after ", after, " steps; expected ",
+            earliest, " to ", count, "; sort the goals by time");
+    advance.sights.push_back({after, require_share(share)});
   }
-  return {std::move(found)};
+  return {std::move(advance)};
 }
 
 Event make_see(std::optional<double> share) { return {See{!share, require_share(share.value_or(1.0))}}; }
 
 Script make_script(std::vector<std::shared_ptr<const Event>> events, double distance, int steps) {
   require(steps >= kFewestStableSteps && steps <= kMostStableSteps,
-          "stable_steps: got fewer than " + std::to_string(kFewestStableSteps) + ", or more than " +
-              std::to_string(kMostStableSteps));
+          "stable_steps: ", steps, "; expected ", kFewestStableSteps, " to ", kMostStableSteps,
+          "; change the time step");
   Script script{std::move(events), {distance, steps}, 0, 0};
   std::size_t held = 0;
   const auto need = [&](const std::vector<int>& nodes) {
     for (int node : nodes) script.nodes = std::max(script.nodes, node + 1);
   };
   for (const auto& event : script.events) {
-    require(event != nullptr, "events: got None");
+    require(event != nullptr, "events: None; expected an Event; leave it out");
     if (const auto* close = std::get_if<Close>(&event->is)) {
-      require(close->row <= script.rows, "row: got one that does not follow those before");
+      require(close->row <= script.rows, "row: ", close->row, "; expected 0 to ", script.rows,
+              "; leave no row out");
       script.rows = std::max(script.rows, close->row + static_cast<int>(close->nodes.size()));
       need(close->nodes);
     } else if (const auto* hold = std::get_if<Hold>(&event->is)) {
@@ -185,17 +201,19 @@ Script make_script(std::vector<std::shared_ptr<const Event>> events, double dist
       for (const auto& grip : advance->grips) {
         gripped += grip->rows.size();
         for (int row : grip->rows)
-          require(row >= 0 && row < script.rows, "grips: got a row that no hand has closed at");
+          require(row >= 0 && row < script.rows, "grips: row ", row, "; expected a row below ", script.rows,
+                  "; close the hand first");
       }
-      require(gripped == held, "grips: got those of other nodes than are held");
+      require(gripped == held, "grips: ", gripped, " nodes; expected the ", held,
+              " that are held; hold the gripped nodes first");
     }
   }
   return script;
 }
 
 void require_step(double step) {
-  require(step > 0.0, "time_step: got none");
-  require_finite("time_step", step);
+  require(step > 0.0 && std::isfinite(step), "time_step: ", step,
+          " s; expected a positive finite time; choose another time step");
 }
 
 /// A flag that one thread sets and others read.
@@ -206,7 +224,8 @@ struct Stop {
 using JobTuple = std::tuple<std::shared_ptr<const Script>, std::shared_ptr<const Start>, py::object, double>;
 
 void require_fit(const Script& script, std::size_t nodes) {
-  require(script.nodes <= static_cast<int>(nodes), "script: got one of a DLO of more nodes");
+  require(script.nodes <= static_cast<int>(nodes), "script: ", script.nodes,
+          " nodes; expected at most the ", nodes, " of the DLO; write the script for this DLO");
 }
 
 /// Nodes at the goals (g, N, 3), settled (g,), and steps; None: the rollout diverged.
@@ -219,18 +238,17 @@ py::object answer(const Outcome& outcome) {
   return py::make_tuple(seen, py::tuple(py::cast(outcome.settled)), outcome.steps);
 }
 
-py::list roll_out(const std::vector<JobTuple>& given, double time_step, const Stop* stop,
-                  const std::string& target) {
+py::list roll_out(const std::vector<JobTuple>& tuples, double time_step, const Stop* stop,
+                  const std::string& name) {
   static const Stop never;
-  const auto& known = targets();
-  const auto chosen = std::find_if(known.begin(), known.end(), [&](const Target& one) {
-    return target.empty() || target == one.name;
+  const auto target = std::find_if(targets().begin(), targets().end(), [&](const Target& candidate) {
+    return name.empty() || name == candidate.name;
   });
-  require(chosen != known.end(), "target: got one that this processor lacks");
+  require(target != targets().end(), "target: ", name, "; expected one of TARGETS; leave it out");
   require_step(time_step);
   std::vector<Job> jobs;
-  for (const auto& [script, start, physical, level] : given) {
-    require(script && start, "jobs: got None");
+  for (const auto& [script, start, physical, level] : tuples) {
+    require(script && start, "jobs: None; expected a Script and a Start; leave the job out");
     require_fit(*script, start->points.size());
     require_finite("level", level);
     jobs.push_back({script, start, properties_of(physical), time_step, level});
@@ -238,32 +256,36 @@ py::list roll_out(const std::vector<JobTuple>& given, double time_step, const St
   std::vector<Outcome> outcomes;
   {
     py::gil_scoped_release released;
-    outcomes = chosen->roll_out(jobs, (stop ? stop : &never)->flag);
+    outcomes = target->roll_out(jobs, (stop ? stop : &never)->flag);
   }
-  py::list found;
-  for (const Outcome& one : outcomes) found.append(answer(one));
-  return found;
+  py::list answers;
+  for (const Outcome& outcome : outcomes) answers.append(answer(outcome));
+  return answers;
 }
 
-/// While a rope follows a script, the script alone holds and aims it.
+/// While a rope follows a script, only the script holds and aims it.
 void require_free(const Rope& rope) {
-  require(!rope.follows, "rope: got a call that only the script it follows may make");
+  require(!rope.follows, "rope: hold, aim or follow while it follows a script; expected only steps; "
+                         "return from `follow` first");
 }
 
 void aim(Rope& rope, const Array& targets, const std::optional<Array>& turns) {
   require_free(rope);
-  auto where = rows<Point>("targets", targets);
-  auto how = rows<Matrix>("turns", turns);
-  require(where.size() == rope.held.size(), "targets: got those of other nodes than are held");
-  require(how.empty() || how.size() == rope.held.size(), "turns: got those of other nodes than are held");
-  rope.targets = std::move(where), rope.turns = std::move(how);
+  auto points = rows<Point>("targets", targets);
+  auto rotations = rows<Matrix>("turns", turns);
+  const std::size_t held = rope.held.size();
+  require(points.size() == held, "targets: ", points.size(), " rows; expected ", held,
+          "; give one per held node");
+  require(rotations.empty() || rotations.size() == held, "turns: ", rotations.size(), " rows; expected ",
+          held, "; give one per held node");
+  rope.targets = std::move(points), rope.turns = std::move(rotations);
 }
 
 py::object follow_script(Rope& rope, const Script& script, const std::function<void()>& step) {
   require_free(rope);
   require_fit(script, rope.rods.points.size());
-  require(step != nullptr, "step: got None");
-  const std::unique_ptr<bool, void (*)(bool*)> until_its_end(&rope.follows, [](bool* on) { *on = false; });
+  require(step != nullptr, "step: None; expected a function; pass one that takes a step");
+  const std::unique_ptr<bool, void (*)(bool*)> reset(&rope.follows, [](bool* flag) { *flag = false; });
   rope.follows = true;
   return answer(follow(script, rope, step));
 }
@@ -271,24 +293,22 @@ py::object follow_script(Rope& rope, const Script& script, const std::function<v
 py::dict state_of(const Rope& rope) {
   const Rods<double>& rods = rope.rods;
   py::list clamps;
-  for (const Clamp& one : rope.clamps)
-    clamps.append(py::make_tuple(one.segment, array_of(std::vector<Point>{one.direction}).squeeze()));
+  for (const Clamp& clamp : rope.clamps)
+    clamps.append(py::make_tuple(clamp.segment, array_of(std::vector<Point>{clamp.direction}).squeeze()));
   return py::dict(
       "drag"_a = rods.drag, "implicit"_a = rods.implicit, "rest_lengths"_a = array_of(rods.rest_lengths),
       "stiffness"_a = array_of(rods.stiffness), "masses"_a = array_of(rods.masses),
       "bending"_a = array_of(rods.bending), "natural"_a = array_of(rods.natural),
       "twisting"_a = array_of(rods.twisting), "angles"_a = array_of(rods.angles),
-      "carried"_a = array_of(rods.carried), "joints"_a = array_of(rods.joints), "clamps"_a = clamps,
+      "bishop"_a = array_of(rods.bishop), "joints"_a = array_of(rods.joints), "clamps"_a = clamps,
       "strands"_a = array_of(rods.strands), "plastic"_a = array_of(rods.plastic),
       "strand_forces"_a = array_of(rods.strand_forces),
-      "frame_impulses"_a = array_of(rods.frame_impulses), "diameter"_a = rope.contact.diameter,
-      "apart"_a = rope.contact.apart, "half"_a = array_of(rope.contact.half),
-      "middles"_a = array_of(rope.contact.middles), "distances"_a = array_of(rope.contact.distances));
+      "frame_impulses"_a = array_of(rods.frame_impulses));
 }
 
 void define_rope(py::module_& module) {
-  py::class_<Rope> rope(module, "Rope", py::module_local());
-  rope.def(py::init([](const Start& start, const py::object& physical, double time_step, double level,
+  py::class_<Rope> type(module, "Rope", py::module_local());
+  type.def(py::init([](const Start& start, const py::object& physical, double time_step, double level,
                        const Array& gravity) {
              require_step(time_step);
              require_finite("level", level);
@@ -297,29 +317,28 @@ void define_rope(py::module_& module) {
            }),
            "start"_a, "physical"_a, "time_step"_a, "level"_a, "gravity"_a);
   const auto share = [&](const char* name, auto member) {
-    rope.def_property_readonly(name, [member](const py::object& self) {
+    type.def_property_readonly(name, [member](const py::object& self) {
       return array_of(member(self.cast<Rope&>()), self);
     });
   };
-  share("points", [](Rope& one) -> auto& { return one.rods.points; });
-  share("velocities", [](Rope& one) -> auto& { return one.rods.velocities; });
-  share("predicted", [](Rope& one) -> auto& { return one.rods.predicted; });
-  share("support", [](Rope& one) -> auto& { return one.rods.support; });
-  share("inverse_masses", [](Rope& one) -> auto& { return one.inverse_masses; });
-  rope.def_property_readonly("masses", [](const Rope& one) { return array_of(one.rods.masses); })
-      .def_property_readonly("held", [](const Rope& one) { return one.held; })
-      .def_property_readonly("targets", [](const Rope& one) { return array_of(one.targets); })
+  share("points", [](Rope& rope) -> auto& { return rope.rods.points; });
+  share("velocities", [](Rope& rope) -> auto& { return rope.rods.velocities; });
+  share("predicted", [](Rope& rope) -> auto& { return rope.rods.predicted; });
+  share("support", [](Rope& rope) -> auto& { return rope.rods.support; });
+  type.def_property_readonly("masses", [](const Rope& rope) { return array_of(rope.rods.masses); })
+      .def_property_readonly("held", [](const Rope& rope) { return rope.held; })
+      .def_property_readonly("targets", [](const Rope& rope) { return array_of(rope.targets); })
       .def_property_readonly("state", &state_of)
-      .def("hold", [](Rope& one, const std::vector<int>& nodes) {
-             require_free(one);
+      .def("hold", [](Rope& rope, const std::vector<int>& nodes) {
+             require_free(rope);
              for (int node : nodes)
-               require(node >= 0 && node < one.rods.nodes, "nodes: got one that the DLO lacks");
-             one.hold(nodes);
+               require(node >= 0 && node < rope.rods.nodes, "nodes: ", node, "; expected 0 to ",
+                       rope.rods.nodes - 1, "; give the index of a node");
+             rope.hold(nodes);
            }, "nodes"_a)
       .def("aim", &aim, "targets"_a, "turns"_a = py::none())
-      .def("predict", [](Rope& one) { return predict(one); })
-      .def("step", [](Rope& one) { return take_step(one); })
-      .def("touch", &touch)
+      .def("predict", [](Rope& rope) { return predict(rope); })
+      .def("step", [](Rope& rope) { return take_step(rope); })
       .def("follow", &follow_script, "script"_a, "step"_a);
 }
 
@@ -329,7 +348,7 @@ void define_rope(py::module_& module) {
 PYBIND11_MODULE(_core, module) {
   using namespace dlo;
   py::list names;
-  for (const Target& one : targets()) names.append(one.name);
+  for (const Target& target : targets()) names.append(target.name);
   module.attr("TARGETS") = py::tuple(names);
 
   py::class_<Start, std::shared_ptr<Start>>(module, "Start", py::module_local())

@@ -13,7 +13,7 @@
 // stiffness, and the determinant shows that c damps the mode like a stiffness-proportional damping of c / dt.
 // So c is dt times the internal damping, but at least 0.6 dt^2 for stability (at 0.5 dt^2 the stiffest modes
 // would ring for ever); at this limit the damping depends on the time step.  The negative part of the matrix
-// of a compressed spring is left out, so that the matrix stays positive definite.
+// of a compressed spring is omitted, so that the whole matrix stays positive definite.
 
 namespace dlo {
 namespace DLO_TARGET {
@@ -49,7 +49,7 @@ inline void push_front(std::array<Number, kBand>& last, Number value) {
   last[1] = value;
 }
 
-/// Subtract from a column, and from its right side, the share of the one that lies `Back` before it.
+/// Subtract from a column and its right side the share of the column that is `Back` columns before it.
 template <int Back, class Number>
 inline void eliminate(const Column<Number>& done, const std::array<Number, kBand>& last,
                       Column<Number>& column, Number& value) {
@@ -60,9 +60,9 @@ inline void eliminate(const Column<Number>& done, const std::array<Number, kBand
 
 /// Write the equations of a step and solve them by L D L^T (Golub and Van Loan, Matrix Computations, 4.3).
 ///
-/// `strand_forces` and `frame_impulses` add the other internal forces, `holding` holds nodes.  The solution is
-/// written to `predicted`, and whether it is finite to `solved`.  Each column is computed in one pass from the
-/// six before it.  The last one stays in registers, so that the next pivot never waits for memory.
+/// `strand_forces` and `frame_impulses` add the other internal forces, `holding` holds nodes.  The solution
+/// is written to `predicted`, and whether it is finite to `solved`.  Each column is computed in one pass from
+/// the six before it.  The last one stays in registers, so that the next pivot never waits for memory.
 template <class Number>
 inline void solve(Rods<Number>& rods) {
   const int n = rods.nodes;
@@ -145,16 +145,19 @@ inline void solve(Rods<Number>& rods) {
   Number total = none;
   last = {};
   const auto back = [&](Number& result) {
-    --columns;
-    for (int k = kBand - 1; k > 0; --k) result = result - (*columns)[k] * (*columns)[0] * last[k];
-    push_front(last, result);
-    total = total + result;
+    const Column<Number>& column = *--columns;
+    const Number inverse = column[0];
+    Number value = result;
+    for (int k = kBand - 1; k > 0; --k) value = value - column[k] * inverse * last[k];
+    push_front(last, value);
+    total = total + value;
+    result = value;
   };
   for (int i = n - 1; i >= 0; --i) back(predicted[i].z), back(predicted[i].y), back(predicted[i].x);
   rods.solved = select(finite(total) & (smallest > 0.0), none + 1.0, none);
 }
 
-/// Upper bounds [m] of how any two nodes, and any two neighbours, move against each other in a step.
+/// Upper bounds [m] of the relative movement of any two nodes, and of two neighbours, in a step.
 template <class Number>
 inline std::array<Number, 2> movement(const std::vector<Vec3<Number>>& rows, double step) {
   const std::size_t n = rows.size();
@@ -168,7 +171,7 @@ inline std::array<Number, 2> movement(const std::vector<Vec3<Number>>& rows, dou
   return {2 * step * sqrt(any), step * sqrt(neighbours)};
 }
 
-/// Turn `predicted` into the velocities after contact with a table, with Coulomb friction, and take the step.
+/// Compute the velocities after contact with a table, with Coulomb friction, from `predicted`; take the step.
 /// The constants are Bullet's (PyBullet 3.2.7), found by single steps of a sphere on a plane.
 template <class Number>
 inline void step_on_table(Rods<Number>& rods) {
@@ -187,8 +190,8 @@ inline void step_on_table(Rods<Number>& rods) {
     if (any(touches)) {
       const Number speed = sqrt(v.x * v.x + v.y * v.y);
       const Number share = select(speed > 0.0, 1.0 - min(1.0, friction * push / speed), 0.0);
-      const Number left = select(touches, share, 1.0);
-      v = {left * v.x, left * v.y, select(touches, wanted, v.z)};
+      const Number scale = select(touches, share, 1.0);
+      v = {scale * v.x, scale * v.y, select(touches, wanted, v.z)};
     }
     velocities[i] = v;
     support[i] = v - predicted[i];

@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 // SPDX-License-Identifier: Apache-2.0
-// Rollout: follows a script with a rope; `roll_out` takes the steps of four ropes at a time, in SIMD lanes.
+// Rollout: a rope that follows a script; `roll_out` takes the steps of four ropes at a time, in SIMD lanes.
 
 #include <algorithm>
 #include <memory>
@@ -12,7 +12,7 @@
 namespace dlo {
 namespace DLO_TARGET {
 
-constexpr int kChecks = 5;  // of the displacement, within the time in which a DLO must not move
+constexpr int kChecks = 5;  // checks of the displacement within the time in which a stable DLO does not move
 
 /// Copy the rows of one lane.
 template <class Number>
@@ -27,7 +27,7 @@ class Rollout {
   Rollout(const Script& script, Rope& rope, Outcome& outcome)
       : rope(rope), outcome(outcome), script_(script), offsets_(script.rows), before_(rope.rods.points) {}
 
-  /// Go on to the next steps; tell whether there are any.
+  /// Go on to the next move; return whether there is one.
   bool next() {
     while (!outcome.diverged && event_ < script_.events.size()) {
       const Event& event = *script_.events[event_++];
@@ -39,11 +39,11 @@ class Rollout {
     return false;
   }
 
-  /// Tell the rope where its held nodes are after the coming step.
+  /// Give the rope the targets of its held nodes in the coming step.
   void aim() {
     std::size_t h = 0;
     for (const auto& grip : move_->grips) {
-      const std::size_t k = std::min<std::size_t>(taken_, grip->positions.size() - 1);
+      const std::size_t k = std::min<std::size_t>(steps_, grip->positions.size() - 1);
       for (int row : grip->rows) {
         const Point& offset = offsets_[row];
         rope.targets[h] =
@@ -54,16 +54,16 @@ class Rollout {
     }
   }
 
-  /// Count a step, after which the nodes are at `rods.points`; tell whether the move has ended.
+  /// Count a step that ended at `rods.points`; return whether the move has ended.
   template <class Number>
   bool arrive(Rods<Number>& rods, int lane) {
     outcome.diverged = in_lane(rods.solved, lane) != 1.0;
     if (outcome.diverged) return true;
-    ++taken_, ++outcome.steps;
-    const bool last = taken_ == move_->count;
+    ++steps_, ++outcome.steps;
+    const bool last = steps_ == move_->count;
     if (!move_->sights.empty()) {
       copy_out(rods.points, lane, now_);
-      see_meanwhile(now_);
+      see_in_motion(now_);
       if (!last) before_.swap(now_);
     }
     if (move_->settles && (--until_check_ == 0 || last)) rests_ = is_stable(rods.points, lane);
@@ -89,17 +89,17 @@ class Rollout {
     outcome.settled.push_back(rests_ || !see.rests);
   }
 
-  /// Begin to take steps, unless none are needed.
+  /// Begin a move, unless the DLO need not settle again.
   bool begin(const Advance& move) {
     if (move.remembers) before_ = rope.rods.points;
     if (move.settles && rests_) return false;
     move_ = &move;
-    taken_ = checks_ = 0, sight_ = 0, rests_ = false;
+    steps_ = checks_ = 0, sight_ = 0, rests_ = false;
     until_check_ = period(0);
-    if (move.settles) seen_[0] = rope.rods.points;
+    if (move.settles) checked_[0] = rope.rods.points;
     rope.turns.resize(rope.clamps.empty() ? 0 : rope.held.size());
     if (!move.sights.empty()) {
-      see_meanwhile(rope.rods.points);
+      see_in_motion(rope.rods.points);
       before_ = rope.rods.points;
     }
     return true;
@@ -112,28 +112,28 @@ class Rollout {
     for (std::size_t i = 0; i < seen.size(); ++i) seen[i] = before_[i] + share * (now[i] - before_[i]);
   }
 
-  void see_meanwhile(const std::vector<Point>& now) {
-    for (; sight_ < move_->sights.size() && move_->sights[sight_].after == taken_; ++sight_) {
+  void see_in_motion(const std::vector<Point>& now) {
+    for (; sight_ < move_->sights.size() && move_->sights[sight_].after == steps_; ++sight_) {
       see_now(now, move_->sights[sight_].share, false);
       outcome.settled.push_back(true);
     }
   }
 
-  /// Steps between two checks.
+  /// Number of steps from a check to the next.
   int period(int check) const {
     const int steps = script_.settling.steps, k = check % kChecks;
     return steps * (k + 1) / kChecks - steps * k / kChecks;
   }
 
-  /// Check whether all nodes have stayed where they were.
+  /// Return whether no node has moved by the distance of `Settling` within its steps.
   template <class Number>
   bool is_stable(std::vector<Vec3<Number>>& points, int lane) {
     until_check_ = period(++checks_);
-    copy_out(points, lane, seen_[checks_ % (kChecks + 1)]);
+    copy_out(points, lane, checked_[checks_ % (kChecks + 1)]);
     if (checks_ < kChecks) return false;
-    const auto& start = seen_[(checks_ + 1) % (kChecks + 1)];
+    const auto& start = checked_[(checks_ + 1) % (kChecks + 1)];
     double furthest = 0.0;
-    for (const auto& later : seen_)
+    for (const auto& later : checked_)
       for (std::size_t i = 0; i < later.size(); ++i) {
         const Point away = later[i] - start[i];
         furthest = max(furthest, dot(away, away));
@@ -144,24 +144,24 @@ class Rollout {
   const Script& script_;
   std::size_t event_ = 0;
   std::vector<Point> offsets_;  // of nodes from the hands that hold them
-  std::vector<Point> before_;   // where the nodes are remembered
+  std::vector<Point> before_;   // remembered points, where the next sight begins
   std::vector<Point> now_;      // workspace
-  bool rests_ = false;          // the DLO came to rest, and nothing has happened since
+  bool rests_ = false;          // the DLO has come to rest since the last event
   const Advance* move_ = nullptr;
-  int taken_ = 0;  // steps of the move
+  int steps_ = 0;  // of the move, so far
   std::size_t sight_ = 0;
   int until_check_ = 0, checks_ = 0;
-  std::array<std::vector<Point>, kChecks + 1> seen_;  // at the last checks
+  std::array<std::vector<Point>, kChecks + 1> checked_;  // points at the last checks
 };
 
-/// A rollout of a rope of its own; its steps are taken together with those of others.
+/// A rollout with its own rope; its steps are taken together with those of others.
 struct LaneRollout {
   LaneRollout(const Job& job, Outcome& outcome)
       : rope(*job.start, job.properties, job.step, {0.0, 0.0, -kGravity}, job.level),
         rollout(*job.script, rope, outcome) {}
 
-  /// Go on to steps that can be taken together with others; tell whether there are any.  The first step of
-  /// a rope, which sets up the state of its frame and strands, is taken alone.
+  /// Go on to steps that can be taken together with others; return whether there are any.  The first step of
+  /// a rope, which initialises the state of its frame and strands, is taken alone.
   bool next() {
     while (rollout.next()) {
       if (rope.has_begun()) return true;
@@ -178,18 +178,18 @@ struct LaneRollout {
 
 using Rollouts = std::vector<Rollout*>;
 
-inline bool contains(const Rollouts& rollouts, const Rollout* one) {
-  return std::find(rollouts.begin(), rollouts.end(), one) != rollouts.end();
+inline bool contains(const Rollouts& rollouts, const Rollout* rollout) {
+  return std::find(rollouts.begin(), rollouts.end(), rollout) != rollouts.end();
 }
 
-/// Take steps until a move ends; return the rollouts whose move has ended.
+/// Take steps until a move ends or `stop` is set; return the rollouts whose move has ended.
 template <class Number>
 Rollouts advance(Rods<Number>& rods, const Rollouts& rollouts, const std::atomic<bool>& stop) {
   Ropes ropes;
-  for (Rollout* one : rollouts) ropes.push_back(&one->rope);
+  for (Rollout* rollout : rollouts) ropes.push_back(&rollout->rope);
   Rollouts ended;
   while (ended.empty() && !stop.load(std::memory_order_relaxed)) {
-    for (Rollout* one : rollouts) one->aim();
+    for (Rollout* rollout : rollouts) rollout->aim();
     take_step(rods, ropes);
     for (std::size_t lane = 0; lane < rollouts.size(); ++lane)
       if (rollouts[lane]->arrive(rods, static_cast<int>(lane))) ended.push_back(rollouts[lane]);
@@ -197,11 +197,11 @@ Rollouts advance(Rods<Number>& rods, const Rollouts& rollouts, const std::atomic
   return ended;
 }
 
-/// DLOs of one kind that are stepped together, each in a lane.
+/// DLOs that are alike and are stepped together, each in a lane.
 class LaneGroup {
  public:
-  /// Let these, of one kind and not more than there are lanes, take steps until a move ends; return the
-  /// rollouts whose move has ended.
+  /// Take steps of rollouts that are alike, at most one per lane, until a move ends or `stop` is set; return
+  /// the rollouts whose move has ended.
   Rollouts advance(const Rollouts& rollouts, const std::atomic<bool>& stop) {
     if (rollouts.size() == 1) {
       assign({});
@@ -215,39 +215,39 @@ class LaneGroup {
   }
 
  private:
-  /// Give exactly these a lane each; those that have one keep it if they can.
+  /// Give each of these rollouts a lane, and no others; a rollout that has a lane keeps it if it can.
   void assign(const Rollouts& rollouts) {
     lanes_.resize(kLanes);
     for (std::size_t lane = 0; lane < lanes_.size(); ++lane)
       if (lanes_[lane] && (lane >= rollouts.size() || !contains(rollouts, lanes_[lane]))) unload(lane);
     lanes_.resize(rollouts.size());
     if (rollouts.empty()) return;
-    const Rods<double>& kind = rollouts.front()->rope.rods;
-    if (!rods_.is_like(kind)) {
+    const Rods<double>& first = rollouts.front()->rope.rods;
+    if (!rods_.is_like(first)) {
       rods_ = Rods<Lanes>();
-      rods_.nodes = kind.nodes, rods_.step = kind.step, rods_.gravity = kind.gravity;
-      rods_.framed = kind.framed, rods_.twists = kind.twists, rods_.strands_rub = kind.strands_rub;
+      rods_.nodes = first.nodes, rods_.step = first.step, rods_.gravity = first.gravity;
+      rods_.framed = first.framed, rods_.twists = first.twists, rods_.strands_rub = first.strands_rub;
       rods_.resize();
     }
-    for (Rollout* one : rollouts)
-      if (!contains(lanes_, one)) {
+    for (Rollout* rollout : rollouts)
+      if (!contains(lanes_, rollout)) {
         const auto lane = std::find(lanes_.begin(), lanes_.end(), nullptr) - lanes_.begin();
-        lanes_[lane] = one;
-        load(one->rope.rods, static_cast<int>(lane));
+        lanes_[lane] = rollout;
+        load(rollout->rope.rods, static_cast<int>(lane));
       }
   }
 
-  void load(Rods<double>& one, int lane) {
-    in_lane(rods_.drag, lane) = one.drag, in_lane(rods_.implicit, lane) = one.implicit;
-    in_lane(rods_.friction, lane) = one.friction, in_lane(rods_.level, lane) = one.level;
+  void load(Rods<double>& rods, int lane) {
+    in_lane(rods_.drag, lane) = rods.drag, in_lane(rods_.implicit, lane) = rods.implicit;
+    in_lane(rods_.friction, lane) = rods.friction, in_lane(rods_.level, lane) = rods.level;
     const auto copy = [lane](auto& rows, const auto& from) {
       each_number(rows, from, lane, [](double& a, double b) { a = b; });
     };
-    each_property(rods_, one, copy);
-    each_state(rods_, one, copy);
+    each_property(rods_, rods, copy);
+    each_state(rods_, rods, copy);
   }
 
-  /// Give a rope its state back.
+  /// Copy the state of a lane back to its rope.
   void unload(std::size_t lane) {
     each_state(rods_, lanes_[lane]->rope.rods, [lane](auto& rows, auto& to) {
       each_number(rows, to, lane, [](double& a, double& b) { b = a; });
@@ -256,32 +256,32 @@ class LaneGroup {
   }
 
   /// Call `act` for each number of a lane and that of one DLO.
-  template <class Rows, class One, class Act>
-  static void each_number(Rows& rows, One& one, std::size_t lane, Act act) {
-    if (one.empty()) return;
-    constexpr std::size_t kNumbers = sizeof(one[0]) / sizeof(double);
-    static_assert(sizeof(rows[0]) == kLanes * sizeof(one[0]));
+  template <class Rows, class Single, class Act>
+  static void each_number(Rows& rows, Single& single, std::size_t lane, Act act) {
+    if (single.empty()) return;
+    constexpr std::size_t kNumbers = sizeof(single[0]) / sizeof(double);
+    static_assert(sizeof(rows[0]) == kLanes * sizeof(single[0]));
     auto* numbers = reinterpret_cast<double*>(rows.data());
-    using Other = std::conditional_t<std::is_const_v<One>, const double, double>;
-    auto* others = reinterpret_cast<Other*>(one.data());
-    for (std::size_t k = 0; k < kNumbers * one.size(); ++k) act(numbers[kLanes * k + lane], others[k]);
+    using Other = std::conditional_t<std::is_const_v<Single>, const double, double>;
+    auto* others = reinterpret_cast<Other*>(single.data());
+    for (std::size_t k = 0; k < kNumbers * single.size(); ++k) act(numbers[kLanes * k + lane], others[k]);
   }
 
   Rods<Lanes> rods_;
   Rollouts lanes_;
 };
 
-/// Choose those that are stepped next: of the most frequent kind, as many as there are lanes.
-inline Rollouts chosen(const std::vector<std::unique_ptr<LaneRollout>>& under_way) {
-  Rollouts found;
+/// The rollouts that are stepped next: as many that are alike as possible, at most one per lane.
+inline Rollouts largest_group(const std::vector<std::unique_ptr<LaneRollout>>& under_way) {
+  Rollouts largest;
   for (const auto& first : under_way) {
     Rollouts alike;
-    for (const auto& one : under_way)
-      if (alike.size() < kLanes && one->rollout.rope.rods.is_like(first->rollout.rope.rods))
-        alike.push_back(&one->rollout);
-    if (alike.size() > found.size()) found = alike;
+    for (const auto& other : under_way)
+      if (alike.size() < kLanes && other->rollout.rope.rods.is_like(first->rollout.rope.rods))
+        alike.push_back(&other->rollout);
+    if (alike.size() > largest.size()) largest = alike;
   }
-  return found;
+  return largest;
 }
 
 inline std::vector<Outcome> roll_out(const std::vector<Job>& jobs, const std::atomic<bool>& stop) {
@@ -290,15 +290,15 @@ inline std::vector<Outcome> roll_out(const std::vector<Job>& jobs, const std::at
   LaneGroup group;
   for (std::size_t begun = 0; !stop;) {
     while (begun < jobs.size() && under_way.size() < 2 * kLanes) {
-      auto one = std::make_unique<LaneRollout>(jobs[begun], outcomes[begun]);
+      auto rollout = std::make_unique<LaneRollout>(jobs[begun], outcomes[begun]);
       ++begun;
-      if (one->next()) under_way.push_back(std::move(one));
+      if (rollout->next()) under_way.push_back(std::move(rollout));
     }
     if (under_way.empty()) break;
-    for (Rollout* one : group.advance(chosen(under_way), stop)) {
-      const auto its = std::find_if(under_way.begin(), under_way.end(),
-                                    [one](const auto& each) { return &each->rollout == one; });
-      if (!(*its)->next()) under_way.erase(its);
+    for (Rollout* ended : group.advance(largest_group(under_way), stop)) {
+      const auto owner = std::find_if(under_way.begin(), under_way.end(),
+                                      [ended](const auto& each) { return &each->rollout == ended; });
+      if (!(*owner)->next()) under_way.erase(owner);
     }
   }
   return outcomes;

@@ -18,12 +18,12 @@ namespace {
 
 constexpr double kNan = std::numeric_limits<double>::quiet_NaN();
 
-/// The place of `k` among `count` that divide a length evenly.
+/// The k-th of the places that divide a length into `count` equal parts.
 double evenly(double length, int k, int count) { return k == count ? length : k * (length / count); }
 
 /// The value at `place`, linear between `values` at `places`.
 double between(double place, const std::vector<double>& places, const std::vector<double>& values) {
-  if (!(place < places.back())) return values.back();  // also of what is no number
+  if (!(place < places.back())) return values.back();  // also for nan
   const auto k = std::upper_bound(places.begin() + 1, places.end(), place) - places.begin();
   const double slope = (values[k] - values[k - 1]) / (places[k] - places[k - 1]);
   return slope * (place - places[k - 1]) + values[k - 1];
@@ -47,7 +47,7 @@ Rope::Rope(const Start& start, const Properties& properties, double step, Point 
     length_ += rods.rest_lengths[i];
   }
   double total = 0.0;
-  for (double one : rods.masses) total += one;
+  for (double mass : rods.masses) total += mass;
   for (int i = 0; i < n; ++i) {
     rods.masses[i] = properties.mass * rods.masses[i] / total;
     if (!start.features.empty()) rods.masses[i] += properties.marker_mass * start.features[i];
@@ -61,15 +61,15 @@ Rope::Rope(const Start& start, const Properties& properties, double step, Point 
     contact.half.push_back(length / 2), contact.middles.push_back(end - length / 2);
   }
   const auto &half = contact.half, &middles = contact.middles;
-  contact.apart = std::max(kTwoPi / 2 * properties.radius, *std::max_element(half.begin(), half.end()));
-  for (contact.next_one = 0; contact.next_one < segments; ++contact.next_one) {
+  contact.least_arc = std::max(kTwoPi / 2 * properties.radius, *std::max_element(half.begin(), half.end()));
+  for (contact.next_segment = 0; contact.next_segment < segments; ++contact.next_segment) {
     bool may_touch = false;
-    for (int i = 0, j = contact.next_one; j < segments; ++i, ++j)
-      may_touch = may_touch || (middles[j] - half[j]) - (middles[i] + half[i]) > contact.apart;
+    for (int i = 0, j = contact.next_segment; j < segments; ++i, ++j)
+      may_touch = may_touch || (middles[j] - half[j]) - (middles[i] + half[i]) > contact.least_arc;
     if (may_touch) break;
   }
-  for (Spheres* balls : {&contact.single, &contact.twin})
-    for (auto* one : {&balls->x, &balls->y, &balls->z, &balls->radius}) one->resize(segments);
+  for (Spheres* spheres : {&contact.single, &contact.twin})
+    for (auto* row : {&spheres->x, &spheres->y, &spheres->z, &spheres->radius}) row->resize(segments);
   begin(contact, rods.points.data());
 
   if (!start.directions.empty() && !properties.rest_curvature.empty()) {
@@ -82,7 +82,7 @@ Rope::Rope(const Start& start, const Properties& properties, double step, Point 
       directions_[i] = by.cosine * across + by.sine * cross(axis, across);
     }
   }
-  held = {-1};  // so that nothing is held anew
+  held = {-1};  // unlike any nodes, so that `hold` does its work
   hold({});
 }
 
@@ -97,11 +97,11 @@ void Rope::hold(const std::vector<int>& nodes) {
   for (int node : held) follows[node] = true, inverse_masses[node] = 0.0;
   for (int i = 0; i + 1 < n; ++i) rigid[i] = follows[i] && follows[i + 1];
 
-  // The length that bends at each inner node, and its stiffness relative to that of the first part.
+  // At each inner node: the length that bends, and its stiffness relative to that of the first part.
   const auto& lengths = rods.rest_lengths;
   const std::vector<double> relative = stiffnesses(rigid);
   std::vector<double> cells(n - 2), weights(n - 2);
-  std::vector<std::array<double, 3>> bends(n - 2);  // [1/m]; multiplied by three nodes, they give the bend
+  std::vector<std::array<double, 3>> bends(n - 2);  // [1/m]; the product with three nodes is the bend
   for (int i = 0; i < n - 2; ++i) {
     cells[i] = ((rigid[i] ? 0.0 : lengths[i]) + (rigid[i + 1] ? 0.0 : lengths[i + 1])) / 2;
     weights[i] = cells[i] > 0 ? relative[i] * (1 / cells[i]) : 0.0;
@@ -114,7 +114,7 @@ void Rope::hold(const std::vector<int>& nodes) {
       for (int i = 0; i < n - 2; ++i)
         rods.bending[i + b][a - b] += weights[i] * bends[i][a] * bends[i][b];
   for (auto& row : rods.bending)
-    for (double& one : row) one *= properties_.bending_stiffness;
+    for (double& entry : row) entry *= properties_.bending_stiffness;
   for (std::size_t i = 0; i < rods.strands.size(); ++i) {
     const double slip = properties_.bending_slip, stiffness = properties_.bending_stiffness * weights[i];
     rods.strands[i] = {bends[i], stiffness * (properties_.bending_friction / slip), cells[i] * slip};
@@ -128,15 +128,15 @@ void Rope::hold_frame(const std::vector<bool>& rigid, const std::vector<double>&
   const auto& knots = properties_.rest_curvature;
   const bool curved = properties_.natural_curvature != 0.0 ||
                       std::any_of(knots.begin(), knots.end(), [](auto& k) { return k[0] || k[1]; });
-  const std::vector<Clamp> known = std::move(clamps);
+  const std::vector<Clamp> former = std::move(clamps);
   clamps.clear();
   rods.twists = properties_.torsion > 0.0;
   for (int i = 0; rods.twists && i < segments; ++i) {
     if (!rigid[i]) continue;
     const int place = static_cast<int>(std::find(held.begin(), held.end(), i) - held.begin());
-    const auto before = std::find_if(known.begin(), known.end(), [&](auto& k) { return k.segment == i; });
+    const auto before = std::find_if(former.begin(), former.end(), [&](auto& k) { return k.segment == i; });
     Clamp clamp{i, place, {kNan, kNan, kNan}, {kNan, kNan, kNan}};
-    if (before != known.end()) clamp.direction = before->direction, clamp.tangent = before->tangent;
+    if (before != former.end()) clamp.direction = before->direction, clamp.tangent = before->tangent;
     else if (!frame_begun && !directions_.empty()) clamp.direction = directions_[i];
     clamps.push_back(clamp);
   }
@@ -160,9 +160,9 @@ void Rope::hold_frame(const std::vector<bool>& rigid, const std::vector<double>&
     }
     const double stiffness = properties_.bending_stiffness * relative[i];
     const double bending = cells[i] > 0 ? stiffness : 0.0;
-    const double one = bending * x, two = bending * y;
-    rods.natural[i] = {one, two, sqrt(one * one + two * two)};
-    // Inside a clamp, any stiffness does.
+    const double natural_x = bending * x, natural_y = bending * y;
+    rods.natural[i] = {natural_x, natural_y, sqrt(natural_x * natural_x + natural_y * natural_y)};
+    // Inside a clamp nothing twists, so that any stiffness will do.
     rods.twisting[i] = rods.twists ? properties_.torsion * stiffness /
                                          (cells[i] > 0 ? cells[i] : rods.rest_lengths[i + 1]) : 0.0;
   }
@@ -171,8 +171,8 @@ void Rope::hold_frame(const std::vector<bool>& rigid, const std::vector<double>&
 std::vector<double> Rope::stiffnesses(const std::vector<bool>& rigid) const {
   const auto &profile = properties_.profile, &lengths = rods.rest_lengths;
   const int parts = static_cast<int>(profile.size()), inner = rods.nodes - 2;
-  std::vector<double> found(inner, 1.0);
-  if (std::all_of(profile.begin(), profile.end(), [](double one) { return one == 1.0; })) return found;
+  std::vector<double> result(inner, 1.0);
+  if (std::all_of(profile.begin(), profile.end(), [](double part) { return part == 1.0; })) return result;
   std::vector<double> bounds = {0.0}, flexibility = {0.0};  // the latter up to each bound
   for (int k = 0; k < parts; ++k) {
     bounds.push_back(evenly(length_, k + 1, parts));
@@ -184,9 +184,9 @@ std::vector<double> Rope::stiffnesses(const std::vector<bool>& rigid) const {
     const auto at = [&](double place) { return between(place, bounds, flexibility); };
     const double total = (rigid[i] ? 0.0 : at(b) - at(a)) + (rigid[i + 1] ? 0.0 : at(c) - at(b));
     const double cell = (rigid[i] ? 0.0 : lengths[i] / 2) + (rigid[i + 1] ? 0.0 : lengths[i + 1] / 2);
-    if (total > 0) found[i] = cell / total;
+    if (total > 0) result[i] = cell / total;
   }
-  return found;
+  return result;
 }
 
 bool predict(Rope& rope) {
@@ -197,13 +197,6 @@ bool predict(Rope& rope) {
 bool take_step(Rope& rope) {
   take_step(rope.rods, {&rope});
   return rope.rods.solved == 1.0;
-}
-
-void touch(Rope& rope) {
-  Rods<double>& rods = rope.rods;
-  rods.next_moves = movement(rods.predicted, rods.step);
-  avoid_self_contact(rods, rope, 0);
-  rods.last_moves = movement(rods.predicted, rods.step);
 }
 
 }  // namespace dlo

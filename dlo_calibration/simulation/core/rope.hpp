@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 // SPDX-License-Identifier: Apache-2.0
-// Rope: one DLO that is simulated, from its properties to its state; Rods: all that determines the internal
-// forces of one DLO, or of four.
+// Rope: the properties and the state of one simulated DLO; Rods: what determines the internal forces of one
+// DLO, or of four.
 
 #pragma once
 
@@ -10,7 +10,7 @@
 
 namespace dlo {
 
-// Numbers of a simulation: a number is a double, or the doubles of four DLOs in SIMD lanes (`Lanes`).
+// A Number is a double, or the doubles of four DLOs in SIMD lanes (`Lanes`).
 
 constexpr int kLanes = 4;  // DLOs that are stepped together
 
@@ -42,9 +42,9 @@ inline void set_lane(Vec3<Number>& v, int k, const Point& to) {
   in_lane(v.x, k) = to.x, in_lane(v.y, k) = to.y, in_lane(v.z, k) = to.z;
 }
 
-constexpr int kBand = 7;  // entries per column of the lower triangle: node i couples with i + 2
+constexpr int kBand = 7;  // entries per column of the lower triangle: node i is coupled with node i + 2
 
-/// A column of the equations' L D L^T: the inverse of D, and below it L D.
+/// A column of the factors L D L^T of a step's equations: the inverse of D, and below it L D.
 template <class Number>
 using Column = std::array<Number, kBand>;
 
@@ -55,24 +55,24 @@ struct Holding {
   Vec3<Number> impulse;  // [N s]
 };
 
-/// A segment's share in the equations of a step.
+/// What a segment adds to the equations of a step.
 template <class Number>
 struct Spring {
   Number across, along;  // stiffness [kg] across the segment, and along it divided by its squared length
   Number impulse;        // [kg/s], to be multiplied by the segment
 };
 
-/// Of the bending matrix [N/m] at a node: the diagonal, and the entries one and two below.
+/// Entries of the bending matrix [N/m] at a node: the diagonal, and the two below it.
 template <class Number>
 using Bending = std::array<Number, 3>;
 
-/// Natural curvature at an inner node, times its bending stiffness [N m], and the length of that vector.
+/// The natural curvature at an inner node times its bending stiffness [N m], and the length of this vector.
 template <class Number>
 struct Natural {
   Number x, y, size;
 };
 
-/// The bend between two segments, in the frame that is carried along the DLO without twist.
+/// The bend between two segments, in the Bishop frame.
 template <class Number>
 struct Joint {
   Number x, y;           // components of the bend
@@ -84,11 +84,11 @@ struct Joint {
 /// Friction between strands at an inner node.
 template <class Number>
 struct Strands {
-  std::array<Number, 3> row;  // [1/m]; multiplied by three nodes, it gives the bend
+  std::array<Number, 3> row;  // [1/m]; its product with three nodes is the bend
   Number stiffness, slip;     // [N m]; the change of the bend at which the strands slip
 };
 
-/// The plastic part of the bend at an inner node, in which friction between strands is free of stress.
+/// The plastic part of the bend at an inner node: the bend at which friction between strands has no stress.
 template <class Number>
 struct PlasticBend {
   Vec3<Number> bend;
@@ -103,18 +103,18 @@ struct StrandForce {
   Vec3<Number> impulse;    // [N s], against the bend
 };
 
-/// One DLO of `nodes` nodes, or four of the same kind.
+/// One DLO of `nodes` nodes, or four like it.
 template <class Number>
 struct Rods {
   int nodes = 0;
-  bool framed = false;   // there is a material frame: the rest shape is curved, or the DLO resists twist
+  bool framed = false;   // it has a material frame: its rest shape is curved, or it resists twist
   bool twists = false;   // it resists twist; else the frame turns freely as a whole
   bool strands_rub = false;
   double step = 0.0;     // [s]
   Point gravity{};       // [m/s^2]
 
   // Properties.
-  Number drag, implicit;   // [1/s]; c [s^2] of the time step, see rod.hpp
+  Number drag, implicit;   // [1/s]; c [s^2], see rod.hpp
   Number friction, level;  // of the table; height of nodes that touch it [m]
   std::vector<Number> rest_lengths, stiffness, masses;
   std::vector<Bending<Number>> bending;
@@ -125,8 +125,8 @@ struct Rods {
   // State.
   std::vector<Vec3<Number>> points, velocities;  // [m], [m/s]
   std::vector<Vec3<Number>> support;             // change of the velocities by the table in the last step
-  std::vector<Number> angles;                    // [rad] of the material frame from the carried one
-  std::vector<Vec3<Number>> carried;  // of the first segment: unit tangent, unit vector across
+  std::vector<Number> angles;                    // [rad] of the material frame from the Bishop frame
+  std::vector<Vec3<Number>> bishop;  // frame of the first segment: unit tangent, unit vector across
   std::vector<Joint<Number>> joints;
   std::vector<PlasticBend<Number>> plastic;
 
@@ -136,13 +136,13 @@ struct Rods {
   std::vector<Column<Number>> columns;  // six of zeros, then those of the matrix
   std::vector<Vec3<Number>> frame_impulses;  // [N s]
   std::vector<Holding<Number>> holding;
-  std::vector<char> any_held;  // whether a DLO has this node held
+  std::vector<char> any_held;  // whether this node is held in any lane
   std::vector<Vec3<Number>> tangents, across;
-  std::vector<Number> inverse_lengths, clamped, given, turning, upper;
+  std::vector<Number> inverse_lengths, clamped, prescribed, turning, upper;
   std::vector<StrandForce<Number>> strand_forces;
-  Number solved;                     // 1 where the last step was finite
-  std::array<Number, 2> last_moves{};  // see `Movement`: in the last step
-  std::array<Number, 2> next_moves;  // and in this one, without contact
+  Number solved;                       // 1 where the last step was finite
+  std::array<Number, 2> last_moves{};  // in the last step, see `Movement`
+  std::array<Number, 2> next_moves;    // in this step, without contact
 
   /// Give the arrays their sizes.
   void resize() {
@@ -152,17 +152,17 @@ struct Rods {
     masses.resize(n), bending.resize(n), springs.resize(n);
     columns.assign(kBand - 1 + 3 * n, Column<Number>{});
     holding.resize(n), any_held.assign(n, false);
-    for (auto* each : {&angles, &inverse_lengths, &clamped, &given, &turning, &upper})
+    for (auto* each : {&angles, &inverse_lengths, &clamped, &prescribed, &turning, &upper})
       each->resize(framed ? segments : 0);
     for (auto* each : {&tangents, &across}) each->resize(framed ? segments : 0);
     frame_impulses.resize(framed ? n : 0);
     natural.resize(framed ? inner : 0), twisting.resize(framed ? inner : 0);
-    joints.resize(framed ? inner : 0), carried.resize(framed ? 2 : 0);
+    joints.resize(framed ? inner : 0), bishop.resize(framed ? 2 : 0);
     strands.resize(strands_rub ? inner : 0), plastic.resize(strands_rub ? inner : 0);
     strand_forces.resize(strands_rub ? n : 0);
   }
 
-  /// Whether it can be stepped together with another one.
+  /// Whether it can be stepped together with another DLO.
   template <class Other>
   bool is_like(const Rods<Other>& other) const {
     return nodes == other.nodes && framed == other.framed && twists == other.twists &&
@@ -174,7 +174,7 @@ struct Rods {
 template <class A, class B, class Copy>
 void each_state(A& a, B& b, Copy copy) {
   copy(a.points, b.points), copy(a.velocities, b.velocities), copy(a.support, b.support);
-  copy(a.angles, b.angles), copy(a.carried, b.carried), copy(a.joints, b.joints), copy(a.plastic, b.plastic);
+  copy(a.angles, b.angles), copy(a.bishop, b.bishop), copy(a.joints, b.joints), copy(a.plastic, b.plastic);
 }
 
 /// Call `copy(x, y)` for each array x of `a` and y of `b` that belongs to the properties.
@@ -192,18 +192,18 @@ struct Properties {
   double length_scale = 1.0, natural_curvature = 0.0, marker_mass = 0.0, torsion = 0.0;
   double bending_friction = 0.0, bending_slip = 0.1, clamp_twist = 0.0;
   std::vector<double> profile = {1.0};  // bending stiffness of parts of equal length, relative to the first
-  std::vector<std::array<double, 2>> rest_curvature;  // [1/m] at places that divide the length evenly
+  std::vector<std::array<double, 2>> rest_curvature;  // [1/m] at evenly spaced places
 };
 
 /// Where a DLO is at the start of a trial.
 struct Start {
   std::vector<double> places;            // (N) [m] arc lengths of the nodes at rest, from 0
   std::vector<Point> points, velocities;  // (N) [m], [m/s]
-  std::vector<double> features;          // (N) number of markers at each node, or none
-  std::vector<Point> directions;        // (N - 1) across segments in clamps; nan where there is none; or none
+  std::vector<double> features;    // (N) number of markers at each node, or empty
+  std::vector<Point> directions;   // (N - 1) unit vectors across segments in clamps, else nan; or empty
 };
 
-/// Upper bounds [m] of how any two nodes, and any two neighbours, move against each other in a step.
+/// Upper bounds [m] of the relative movement of any two nodes, and of two neighbours, in a step.
 struct Movement {
   double any, neighbours;
 };
@@ -216,38 +216,38 @@ struct Contact {
   Point normal;                    // from the second to the first segment
   double mobility;                 // relative velocity per impulse [1/kg]
   double least;                    // least velocity along the normal [m/s]
-  double pushed;                   // total impulse along the normal [N s]
-  Point rubbed;                    // total impulse across it
+  double normal_impulse;           // so far [N s]
+  Point friction_impulse;          // so far [N s]
 };
 
-/// Spheres [m], each array one coordinate.
+/// Spheres [m], by coordinate.
 struct Spheres {
   std::vector<double> x, y, z, radius;
 };
 
-/// Spheres at the nodes would let parts of a thin DLO through, because its nodes lie further apart than its
-/// diameter.  Two segments whose arc-length distance is below half the circumference of the cross-section
-/// cannot touch: that is the shortest hairpin.  Pairs that are nearer than a diameter at the start keep that
-/// distance until they have moved apart, so that a radius that is too large does not burst the DLO open.
+/// Contact is between segments: nodes of a thin DLO lie further apart than its diameter, so that spheres at
+/// the nodes would let it through.  Two segments cannot touch if their arc-length distance is below half the
+/// circumference of the cross-section, the shortest hairpin.  Pairs that are nearer than a diameter at the
+/// start keep that distance until they have moved apart: a radius that is too large does not burst the DLO.
 struct SelfContact {
   double diameter = 0.0, friction = 0.0;
-  double apart = 0.0;                  // least arc length [m] between two segments that can touch
-  int next_one = 0;                    // how many segments further the first one is that a segment can touch
-  std::vector<double> half, middles;   // [m] of segments: half their lengths, arc lengths of their middles
+  double least_arc = 0.0;              // least arc length [m] between two segments that can touch
+  int next_segment = 0;                // least difference of the indices of two segments that can touch
+  std::vector<double> half, middles;   // [m] of segments: half lengths, arc lengths of the middles
   std::vector<double> distances;       // [m] (S, S), row by row: least distances of pairs
   bool overlaps = false;               // some of them may be below the diameter
-  std::vector<std::array<int, 2>> near;  // pairs that are near each other
-  // How far [m] neighbours may still move against each other until segments that are near along the DLO can
-  // touch; how far any nodes may until others can; and until `near` must be found anew.
+  std::vector<std::array<int, 2>> near;  // neighbour list: pairs whose gap is within the Verlet skin
+  // Room [m] for relative movement: of neighbours, until segments that are near along the DLO can touch; of
+  // any nodes, until others can touch, and until `near` is out of date.
   double room_beside = -1.0, room_away = -1.0, room_near = -1.0;
-  std::vector<Contact> contacts;  // workspace, like the following
+  std::vector<Contact> contacts;  // workspace, as are the following
   std::vector<Point> change;
   Spheres single, twin;
 };
 
 /// A segment that a clamp keeps from turning about its axis.
 struct Clamp {
-  int segment, held;  // the latter: which of the held nodes tells how it turns
+  int segment, held;  // `held`: index in `Rope::held` of the node whose hand turns it
   Point direction;    // unit vector of the material frame; nan: unknown
   Point tangent;      // of the segment in the last step; nan: unknown
 };
@@ -256,22 +256,22 @@ class Rope {
  public:
   Rope(const Start& start, const Properties& properties, double step, Point gravity, double level);
 
-  /// Let exactly these nodes follow given positions from now on.  A segment between two of them is rigid, so
-  /// that bending begins at its end, where a clamped DLO leaves its clamp.
+  /// Hold exactly these nodes from now on: they go to `targets`.  A segment between two of them is rigid, so
+  /// that bending begins where a clamped DLO leaves its clamp.
   void hold(const std::vector<int>& nodes);
 
-  /// Whether its first step, which sets up the state of frame and friction, has been taken.
+  /// Whether its first step has been taken, which initialises the state of frame and strands.
   bool has_begun() const { return (!rods.framed || frame_begun) && (!rods.strands_rub || strands_begun); }
 
   Rods<double> rods;
   SelfContact contact;
   std::vector<int> held;
-  std::vector<Point> targets, hand_velocities;  // of held nodes in the coming step: where to [m]; [m/s]
-  std::vector<Matrix> turns;           // how their hands turn in that step; empty: with the segment
+  std::vector<Point> targets, hand_velocities;  // of held nodes: after the coming step [m]; in it [m/s]
+  std::vector<Matrix> turns;           // of their hands in the coming step; empty: clamps turn with segments
   std::vector<Clamp> clamps;
   std::vector<double> inverse_masses;  // 0 for held nodes
   bool frame_begun = false, strands_begun = false;
-  bool follows = false;  // a script, which alone holds and aims it
+  bool follows = false;  // it follows a script; then only the script holds and aims it
 
  private:
   void hold_frame(const std::vector<bool>& rigid, const std::vector<double>& stiffnesses,
@@ -283,16 +283,12 @@ class Rope {
   double length_ = 0.0;            // at rest [m]
 };
 
-using Ropes = std::vector<Rope*>;  // those that are stepped together, one in each lane
+using Ropes = std::vector<Rope*>;  // stepped together, one in each lane
 
-/// Find the velocities of a rope without contact with others, with its `targets` and `turns`; tell whether
-/// they are finite.
+/// Compute the velocities `predicted` without contact with other bodies; return whether they are finite.
 bool predict(Rope& rope);
 
-/// Take a step on a table; tell whether the rope is still finite.
+/// Take a step on a table; return whether the rope is still finite.
 bool take_step(Rope& rope);
-
-/// Let self-contact change `predicted` as in a step, for tests.
-void touch(Rope& rope);
 
 }  // namespace dlo

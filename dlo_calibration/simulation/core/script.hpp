@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 // SPDX-License-Identifier: Apache-2.0
-// Script: the events of a trial, which do not depend on the DLO's properties; Outcome: what a rollout gives.
+// Script: the events of a trial, independent of the DLO's properties; Outcome: the result of a rollout.
 
 #pragma once
 
@@ -16,7 +16,7 @@ namespace dlo {
 
 constexpr double kGravity = 9.81;  // m/s^2
 
-/// A hand closes: its nodes keep their offsets from it from now on, as rows of a table, from `row` on.
+/// A hand closes: from now on its nodes keep their offsets from it, which are rows of a table, from `row` on.
 struct Close {
   int row;
   std::vector<int> nodes;
@@ -28,31 +28,31 @@ struct Hold {
   std::vector<int> nodes;
 };
 
-/// Nodes that a hand holds while steps are taken; after the last of these poses, it stays.
+/// The nodes that a hand holds and its poses while steps are taken; it stays in the last pose.
 struct Grip {
   std::vector<int> rows;         // of the table of offsets, one for each node
   std::vector<Point> positions;  // [m] of the hand after each step
-  std::vector<Matrix> rotations;  // since it closed, after each step; or none: it does not turn
+  std::vector<Matrix> rotations;  // since it closed, after each step; empty: it does not turn
   std::vector<Matrix> turns;      // in each step
 };
 
-/// The DLO is seen on the way to where it is after some steps, so far (0 to 1) from where it was before the
-/// last one of them; before the first step, from where it is remembered.
+/// The DLO is seen within a step: at the share (0 to 1) of the way from its points before the last of `after`
+/// steps to its points after it.  If `after` is 0, the way begins at the remembered points.
 struct Sight {
   int after;
   double share;
 };
 
-/// Steps are taken, and meanwhile the DLO is seen.
+/// A move: steps are taken, in which the DLO is seen.
 struct Advance {
   std::vector<std::shared_ptr<const Grip>> grips;
-  int count = 0;              // of steps; with `settles`, the most
-  bool settles = false;       // they end as soon as the DLO is stable
-  bool remembers = false;     // where the DLO is before is kept for what is seen next
+  int count = 0;              // of steps; with `settles`, the limit
+  bool settles = false;       // the steps end as soon as the DLO is stable
+  bool remembers = false;     // the points before the first step are remembered for the next `See`
   std::vector<Sight> sights;  // in order
 };
 
-/// The DLO is seen at rest, or where `share` says, as in `Sight`.
+/// The DLO is seen at rest, or at a share of the way from the remembered points.
 struct See {
   bool rests;
   double share;
@@ -68,12 +68,12 @@ struct Settling {
   int steps;
 };
 
-/// Events that have been checked: nothing needs to be checked in a step.
+/// Checked events, so that no step needs to check anything.
 struct Script {
   std::vector<std::shared_ptr<const Event>> events;
   Settling settling;
   int rows = 0;   // of the table of offsets
-  int nodes = 0;  // that a DLO must have at least
+  int nodes = 0;  // least number of nodes of a DLO
 };
 
 /// A trial to simulate with a parameter set.
@@ -85,10 +85,10 @@ struct Job {
   double level;  // height of nodes that touch the table [m]
 };
 
-/// What a rollout gives.
+/// The result of a rollout.
 struct Outcome {
   std::vector<std::vector<Point>> seen;  // nodes at each goal [m]
-  std::vector<bool> settled;             // false: the goal is a stable configuration, and it was not stable
+  std::vector<bool> settled;             // for each goal; false: it is a stable one, and the DLO did not rest
   int steps = 0;
   bool diverged = false;
 };
@@ -99,10 +99,10 @@ struct Target {
   std::vector<Outcome> (*roll_out)(const std::vector<Job>& jobs, const std::atomic<bool>& stop);
 };
 
-/// The kinds of processors whose code this one can execute, the fastest first.  All give the same bits.
+/// The targets whose code this processor can execute, the fastest first.  All give the same bits.
 const std::vector<Target>& targets();
 
-/// Follow a script with a rope whose steps somebody else takes; `step` reads its `targets` and `turns`.
+/// Follow a script with a rope; `step` takes each step, with the rope's `targets` and `turns`.
 Outcome follow(const Script& script, Rope& rope, const std::function<void()>& step);
 
 }  // namespace dlo

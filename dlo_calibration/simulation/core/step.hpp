@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 // SPDX-License-Identifier: Apache-2.0
-// A step: each physical term in its order.  These headers are compiled once for each kind of processor.
+// A step: the physical terms in their order.  These headers are compiled once per target.
 
 #include "arithmetic.hpp"
 #include "self_contact.hpp"
@@ -11,7 +11,7 @@
 namespace dlo {
 namespace DLO_TARGET {
 
-/// Call `act` for each held node: with its lane, its index, its velocity and where it is after the step.
+/// Call `act` for each held node, with its lane, index, velocity and target.
 template <class Act>
 inline void each_held(const Ropes& ropes, Act act) {
   for (std::size_t lane = 0; lane < ropes.size(); ++lane) {
@@ -21,7 +21,7 @@ inline void each_held(const Ropes& ropes, Act act) {
   }
 }
 
-/// Let held nodes follow the velocities that their hands give them.
+/// Give held nodes the velocities of their hands.
 template <class Number>
 inline void hold(Rods<Number>& rods, const Ropes& ropes) {
   std::fill(rods.any_held.begin(), rods.any_held.end(), false);
@@ -34,7 +34,7 @@ inline void hold(Rods<Number>& rods, const Ropes& ropes) {
   });
 }
 
-/// Keep one DLO from passing through itself in the coming step.
+/// Keep the DLO in a lane from passing through itself in the coming step.
 template <class Number>
 inline void avoid_self_contact(Rods<Number>& rods, Rope& rope, int lane) {
   std::vector<Point>& points = rope.rods.points;
@@ -45,8 +45,8 @@ inline void avoid_self_contact(Rods<Number>& rods, Rope& rope, int lane) {
   const auto moved = [&](std::array<Number, 2>& by) {
     return Movement{in_lane(by[0], lane), in_lane(by[1], lane)};
   };
-  const auto look = [&] { return copy(rods.points, points), points.data(); };
-  if (!is_near(rope.contact, moved(rods.last_moves), moved(rods.next_moves), look)) return;
+  const auto current = [&] { return copy(rods.points, points), points.data(); };
+  if (!is_near(rope.contact, moved(rods.last_moves), moved(rods.next_moves), current)) return;
   copy(rods.points, points), copy(rods.predicted, rope.rods.predicted), copy(rods.support, rope.rods.support);
   keep_apart(rope.contact, points.data(), rope.rods.predicted.data(), rods.nodes, rope.inverse_masses.data(),
              rope.rods.support.data(), rods.step);
@@ -54,8 +54,8 @@ inline void avoid_self_contact(Rods<Number>& rods, Rope& rope, int lane) {
     for (int i = 0; i < rods.nodes; ++i) set_lane(rods.predicted[i], lane, rope.rods.predicted[i]);
 }
 
-/// Find the velocities due to gravity, internal forces and self-contact, with `targets` and `turns` of each
-/// rope; where that is not finite, `solved` is 0.
+/// Compute the velocities due to gravity, internal forces and self-contact, with the `targets` and `turns` of
+/// each rope; `solved` becomes 0 where they are not finite.
 template <class Number>
 void predict(Rods<Number>& rods, const Ropes& ropes) {
   const double step = rods.step;
@@ -64,7 +64,7 @@ void predict(Rods<Number>& rods, const Ropes& ropes) {
       const Point way = ropes[lane]->targets[h] - in_lane(rods.points[ropes[lane]->held[h]], lane);
       ropes[lane]->hand_velocities[h] = {way.x / step, way.y / step, way.z / step};
     }
-  constexpr bool kTogether = lanes_of<Number> > 1;  // from their second step on
+  constexpr bool kTogether = lanes_of<Number> > 1;  // then each rope has taken its first step
   if (rods.strands_rub) {
     find_strand_forces(rods, kTogether || ropes[0]->strands_begun);
     ropes[0]->strands_begun = true;

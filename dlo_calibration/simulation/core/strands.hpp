@@ -1,17 +1,18 @@
 // SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 // SPDX-License-Identifier: Apache-2.0
-// Friction between the strands of a cable, which resist bending as an elastic, perfectly plastic element
-// beside the elastic one (Iwan, A Distributed-Element Model for Hysteresis, 1966).
+// Friction between the strands of a cable: an elastic, perfectly plastic element parallel to the elastic
+// bending stiffness (Iwan, A Distributed-Element Model for Hysteresis, 1966).
 //
-// Its state is the bend p_i at which it is free of stress, first that of the start: e = t_i - t_(i-1) - p_i
-// causes the moment k EI e / l, and where |e| exceeds l slip, p_i follows.  p_i turns with the DLO by the
-// smallest rotation; the nodes that turn it bear the torque, without which the element would gain energy.
+// Its state is the plastic bend p_i, at which it has no stress; the DLO starts there.  The strain
+// e = t_i - t_(i-1) - p_i causes the moment k EI e / l, and where |e| exceeds l slip, p_i follows.  p_i turns
+// with the DLO by the smallest rotation.  The nodes that turn it bear the torque; otherwise the element would
+// gain energy.
 
 namespace dlo {
 namespace DLO_TARGET {
 
 constexpr double kHairpin = 0.01;  // least squared cosine of half an angle between segments: limits divisions
-constexpr double kAhead = 0.6;     // c of friction between strands, relative to the squared step
+constexpr double kImplicit = 0.6;  // c of friction between strands, relative to the squared time step
 
 /// The factor that shortens a vector to the length `longest`; 1 if it is not longer.
 template <class Number>
@@ -23,7 +24,7 @@ inline Number limited(const Vec3<Number>& v, Number longest) {
   return share;
 }
 
-/// 1 / square, the squared length of the sum of two unit vectors, which are mostly parallel.
+/// 1 / `square`, the squared length of the sum of two unit vectors that are nearly parallel.
 template <class Number>
 inline Number inverse_of(Number square) {
   const Number away = 1.0 - square / 4;
@@ -33,10 +34,10 @@ inline Number inverse_of(Number square) {
   return inverse;
 }
 
-/// Write to `strand_forces` what friction between strands adds to the equations of the nodes.
+/// Compute `strand_forces`, what friction between strands adds to the equations of the nodes.
 ///
 /// The plastic bend turns by the smallest rotation of the mean tangent.  Where the strands are going to slip
-/// in this step, the stiffness is that of the secant: a larger one would brake too much, a smaller one
+/// in this step, the secant stiffness is used: a larger stiffness would brake too much, a smaller one
 /// rattle.
 template <class Number>
 inline void find_strand_forces(Rods<Number>& rods, bool begun) {
@@ -45,9 +46,9 @@ inline void find_strand_forces(Rods<Number>& rods, bool begun) {
   const auto* all_strands = rods.strands.data();
   auto* bends = rods.plastic.data();
   StrandForce<Number>* forces = rods.strand_forces.data();
-  const double step = rods.step, implicit = kAhead * step * step;
+  const double step = rods.step, implicit = kImplicit * step * step;
   // Three loops, so that the processor works on several nodes at the same time.
-  for (int i = 0; i < inner; ++i) {  // the plastic bend turns with the tangent
+  for (int i = 0; i < inner; ++i) {  // turn the plastic bend with the tangent
     const Vec3<Number> chord = points[i + 2] - points[i];
     const Number inverse = 1.0 / sqrt(dot(chord, chord));
     const Vec3<Number> tangent = inverse * chord;
@@ -58,10 +59,10 @@ inline void find_strand_forces(Rods<Number>& rods, bool begun) {
       const Number share = dot(sum, plastic.bend) * inverse_of(dot(sum, sum)) * 2;
       plastic.bend = plastic.bend + along * tangent - share * sum;
     }
-    plastic.tangent = tangent;
+    plastic.tangent = inverse * chord;
     forces[i].matrix[0] = inverse;
   }
-  for (int i = 0; i < inner; ++i) {  // and follows the bend
+  for (int i = 0; i < inner; ++i) {  // let it follow the bend
     const Strands<Number>& strands = all_strands[i];
     PlasticBend<Number>& plastic = bends[i];
     const auto& [r0, r1, r2] = strands.row;
@@ -69,15 +70,15 @@ inline void find_strand_forces(Rods<Number>& rods, bool begun) {
     Vec3<Number> strain{}, coming{};
     if (begun) {
       strain = bend - plastic.bend;
-      coming = kAhead * (strain - plastic.strain);
+      coming = kImplicit * (strain - plastic.strain);
       strain = limited(strain, strands.slip) * strain;
     }
     plastic.bend = bend - strain, plastic.strain = strain;
     forces[i].matrix[1] = strands.stiffness * limited(strain + coming, strands.slip);
   }
-  // What the joints so far add to the next two nodes.
+  // Contributions of the joints so far to the next two nodes.
   const Number none{};
-  Number next = none, beside_next = none, after = none;  // diagonals, and the entry below the first of them
+  Number next = none, beside_next = none, after = none;  // diagonals, and the entry below the first diagonal
   Vec3<Number> next_impulse{}, after_impulse{};
   for (int i = 0; i < inner; ++i) {
     const auto& [r0, r1, r2] = all_strands[i].row;
@@ -94,8 +95,9 @@ inline void find_strand_forces(Rods<Number>& rods, bool begun) {
     next_impulse = after_impulse + r1 * moment;
     after_impulse = r2 * moment - torque;
   }
-  forces[inner] = {{next, beside_next, none}, next_impulse};
-  forces[inner + 1] = {{after, none, none}, after_impulse};
+  // The other entries stay zero.
+  forces[inner].matrix[0] = next, forces[inner].matrix[1] = beside_next, forces[inner].impulse = next_impulse;
+  forces[inner + 1].matrix[0] = after, forces[inner + 1].impulse = after_impulse;
 }
 
 }  // namespace DLO_TARGET

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.chain import Floats, frozen_array
-from dlo_calibration.reading import read_first, read_octets
+from dlo_calibration.reading import parse_yaml, read_octets
 
 MAXIMUM_OCTETS = 10**5  # of a file; those of camera_calibration have 1000
 SAME_ASPECT = 0.005  # pictures whose aspect ratios differ by less are scaled ones; a row may be missing
@@ -50,17 +50,16 @@ class Lens:
         object.__setattr__(self, 'matrix', frozen_array(self.matrix))
         object.__setattr__(self, 'coefficients', frozen_array(self.coefficients))
 
-    def fitted(self, size: tuple[int, int], thing: str = 'camera calibration') -> Lens:
+    def resized(self, size: tuple[int, int]) -> Lens:
         """
         Return the lens of the same camera for pictures of another size.
 
-        :param thing: what it is called in errors.
         :raises InputError: where the pictures have another aspect ratio.
         """
         (width, height), (wide, high) = self.size, size
         if abs(wide * height / (width * high) - 1.0) > SAME_ASPECT:
             turned = abs(high * height / (width * wide) - 1.0) <= SAME_ASPECT
-            raise InputError(thing, f'pictures of {width} x {height} pixels',
+            raise InputError('camera calibration', f'pictures of {width} x {height} pixels',
                              f'the aspect ratio of the photograph, {wide} x {high} pixels',
                              'hold the camera as in the calibration' if turned
                              else 'calibrate the camera with pictures like the photograph')
@@ -82,8 +81,9 @@ class Lens:
         seen = np.asarray(pixels, float).reshape(-1, 2)
         if not self.coefficients.any() and not self.fisheye or not len(seen):
             return seen.copy()
-        undo = cv2.fisheye.undistortPoints if self.fisheye else cv2.undistortPoints
-        directions = undo(np.ascontiguousarray(seen[:, None]), self.matrix, self.coefficients).reshape(-1, 2)
+        undistort = cv2.fisheye.undistortPoints if self.fisheye else cv2.undistortPoints
+        directions = undistort(
+            np.ascontiguousarray(seen[:, None]), self.matrix, self.coefficients).reshape(-1, 2)
         # OpenCV stops after a fixed number of steps; more steps reach full precision.
         with np.errstate(all='ignore'):
             for _ in range(20):
@@ -91,13 +91,13 @@ class Lens:
                 if not np.nanmax(np.abs(error), initial=0.0) > 1e-10:
                     break
                 directions = directions - error
-            far = ~(np.abs(error).max(axis=1) < 1e-5)  # a hundredth of a pixel
+            unsolved = ~(np.abs(error).max(axis=1) < 1e-5)  # a hundredth of a pixel
             ideal: Floats = directions @ self.matrix[:2, :2].T + self.matrix[:2, 2]
-        ideal[far] = np.nan
+        ideal[unsolved] = np.nan
         return ideal
 
     def _normal(self, pixels: Floats) -> Floats:
-        """Return pixels (n, 2) as directions (x, y, 1), of which x, y (n, 2) are given."""
+        """Return x, y (n, 2) of the directions (x, y, 1) that pixels (n, 2) show."""
         (skewed, skew, across), (_, high, down) = self.matrix[:2]
         y = (pixels[:, 1] - down) / high
         return np.stack([(pixels[:, 0] - across - skew * y) / skewed, y], axis=1)
@@ -109,8 +109,8 @@ class Lens:
         if self.fisheye:
             pixels = cv2.fisheye.distortPoints(points, self.matrix, self.coefficients)
         else:
-            still = np.zeros(3)
-            pixels, _ = cv2.projectPoints(cv2.convertPointsToHomogeneous(points), still, still, self.matrix,
+            zero = np.zeros(3)
+            pixels, _ = cv2.projectPoints(cv2.convertPointsToHomogeneous(points), zero, zero, self.matrix,
                                          self.coefficients if len(self.coefficients) else None)
         return np.asarray(pixels, float).reshape(-1, 2)
 
@@ -126,10 +126,10 @@ def read_lens(path: Path) -> Lens:
     try:
         if len(octets) > MAXIMUM_OCTETS:
             raise ValueError('too large')
-        document = read_first(octets)
+        document = parse_yaml(octets)
         document.get('camera_matrix', document.get('k'))
     except Exception as error:  # damaged YAML can raise anything
-        raise InputError(thing, 'a file that is no such document', EXPECTED,
+        raise InputError(thing, 'another kind of file', EXPECTED,
                          'name the file that the calibration wrote') from error
     return _lens(document, thing)
 
@@ -152,12 +152,12 @@ def _lens(document: dict[str, Any], thing: str) -> Lens:
             or not 0.0 < matrix[0, 2] < width or not 0.0 < matrix[1, 2] < height
             or not np.abs(coefficients).max(initial=0.0) < 1e6):
         raise InputError(thing, 'numbers that no camera has', EXPECTED,
-                         'look at image_width, image_height and camera_matrix in it')
+                         'check its image_width, image_height and camera_matrix')
     return Lens((width, height), matrix, coefficients, model in FISHEYE)
 
 
 def _numbers(document: dict[str, Any], thing: str, names: tuple[str, ...], counts: tuple[int, ...]) -> Floats:
-    """Return the numbers (n,) of a document, under the first of `names` that it has; n is one of `counts`."""
+    """Return the numbers (n,) under the first of `names` in a document; n is in `counts`."""
     name = next((name for name in names if name in document), names[0])
     value = document.get(name)
     value = value.get('data') if isinstance(value, dict) else value

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Camera calibrations are read as ROS writes them, and distortion is taken away and put back."""
+"""Camera calibrations are read as ROS writes them; distortion is removed and applied exactly."""
 
 import os
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dlo_calibration.errors import InputError
-from dlo_calibration.vision.camera import Lens, read_lens
+from dlo_calibration.vision.lens import Lens, read_lens
 
 FILE = """\
 image_width: 1280
@@ -100,7 +100,7 @@ def test_a_calibration_is_read(text, tmp_path):
     ('equidistant', [-0.02, 0.01, -0.005, 0.001]),
     ('plumb_bob', [0.0] * 5),
 ])
-def test_distortion_is_taken_away_exactly(model, coefficients, tmp_path):
+def test_distortion_is_removed_exactly(model, coefficients, tmp_path):
     text = FILE.replace('plumb_bob', model).replace('[-0.1, 0.05, 0.001, -0.002, 0.01]', str(coefficients))
     lens = lens_of(text, tmp_path)
     ideal = lens.undistorted(PLACES)
@@ -119,7 +119,7 @@ def test_a_fisheye_lens_sees_angles():
     assert lens.distorted(ideal) == pytest.approx(seen, abs=1e-4)
 
 
-def test_a_pixel_that_no_direction_leads_to_is_not_a_number():
+def test_a_pixel_that_no_direction_reaches_becomes_not_a_number():
     """With strong barrel distortion, no direction is seen farther from the middle than 0.77 focal lengths."""
     lens = Lens((4000, 100), [[1000.0, 0.0, 2000.0], [0.0, 1000.0, 50.0], [0.0, 0.0, 1.0]],
                 [-0.25, 0.0, 0.0, 0.0])
@@ -129,14 +129,14 @@ def test_a_pixel_that_no_direction_leads_to_is_not_a_number():
 
 def test_a_calibration_serves_photographs_of_other_sizes(tmp_path):
     lens = lens_of(FILE, tmp_path)
-    large = lens.fitted((2560, 1920))
+    large = lens.resized((2560, 1920))
     # Pixel (0, 0) of the small picture is the middle of four pixels of the large one.
     ideal = 2.0 * lens.undistorted(PLACES) + 0.5
     assert large.undistorted(2.0 * PLACES + 0.5) == pytest.approx(ideal, abs=1e-6)
     with pytest.raises(InputError, match='aspect ratio'):
-        lens.fitted((1920, 1080))
+        lens.resized((1920, 1080))
     with pytest.raises(InputError, match='hold the camera as in the calibration'):
-        lens.fitted((960, 1280))
+        lens.resized((960, 1280))
 
 
 def test_a_calibration_without_distortion_has_none(tmp_path):
@@ -161,7 +161,7 @@ def test_a_calibration_without_distortion_has_none(tmp_path):
     ('image_width: 1280', 'image_width: {}', 'image_width'),
     ('camera_matrix', 'matrix', 'camera_matrix'),
 ])
-def test_a_calibration_that_cannot_be_is_refused(old, new, words, tmp_path):
+def test_a_calibration_with_impossible_values_is_refused(old, new, words, tmp_path):
     assert old in FILE
     assert words in refusal(FILE.replace(old, new), tmp_path)
 
