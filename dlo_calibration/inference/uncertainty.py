@@ -11,8 +11,8 @@ into account:
 - the errors of neighbouring points are correlated, so that these count as fewer;
 - the initial chain of each trial is measured with noise, too, and so are length and shape of the DLO;
 - if noise cannot explain the residuals, the trials may disagree with each other; the jackknife and
-  the bootstrap over the trials measure how much, and the larger of both counts; an interval contains
-  what the trials say without any one of them;
+  the bootstrap over the trials measure how much more than by chance, and the larger of both counts; an
+  interval contains what the trials say without any one of them;
 - the step and the nodes of the simulation move the optimum;
 - trials that look alike share the error of the model, so that repeating one averages only its noise;
 - the reported point may be beside the minimum, after a search that does not converge (`Uncertainty.at`).
@@ -215,11 +215,13 @@ def at_minimum(fit: Linearisation, layout: ResidualLayout, *, noise: float = flo
     if len(layout.shapes) >= 2 and not residual < (DISAGREEMENT + chance) * noise:
         parts: Sequence[Rows] = layout.rows if len(groups) < 3 else [
             np.concatenate([np.r_[layout.rows[k]] for k in group]) for group in groups]
-        without = jackknife(weighted, parts, prior)
-        if len(parts) >= 3:  # two say too little of a variance
-            disagreement = np.maximum(np.var(without, axis=0) * (len(parts) - 1),
-                                      np.var(bootstrap(weighted, parts, prior), axis=0))
-            extra = np.maximum(disagreement - np.diag(covariance), 0.0)
+        count = len(parts)
+        without, by_chance = resampled(weighted, parts, prior, 1 - np.eye(count))
+        if count >= 3:  # two say too little of a variance
+            drawn, drawn_by_chance = resampled(weighted, parts, prior, bootstrap_counts(count))
+            extra = np.maximum.reduce([
+                (count - 1) * np.mean(without**2 - by_chance, axis=0),
+                np.mean(drawn**2 - drawn_by_chance, axis=0), extra])
     if shift is not None:
         extra = extra + (2 * shift)**2  # twice as fine halves the error, which is of first order
     if len(starts):  # the noise of each trial's own initial chain moves the optimum by a Gauss-Newton step
@@ -315,37 +317,48 @@ def jackknife(fit: Linearisation, groups: Sequence[Rows], prior: Floats) -> Floa
     """
     Return (T, d): how far the optimum moves when each group of residuals in turn is left out.
 
-    One Gauss-Newton step from the common optimum (the jackknife of Efron and
-    Tibshirani, An Introduction to the Bootstrap, 1993, 11, linearised).
+    This is the jackknife (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, 11), linearised.
 
     :param groups: the rows of T trials or folds.
     :param prior: (d, d) added to the information.
     """
-    information, gradient = fit.information, fit.gradient
-    moved = []
-    for part in (fit.rows(rows) for rows in groups):
-        rest = information - part.information + prior
-        moved.append(-np.linalg.solve(rest, gradient - part.gradient))
-    return np.array(moved)
+    return resampled(fit, groups, prior, 1 - np.eye(len(groups)))[0]
 
 
-def bootstrap(fit: Linearisation, groups: Sequence[Rows], prior: Floats, draws: int = 200) -> Floats:
+def bootstrap_counts(groups: int, draws: int = 200) -> Floats:
     """
-    Return (draws, d): how far the optimum moves when T trials are drawn from the T trials with replacement.
+    Return (draws, T): how often each of T groups is drawn, when T are drawn with replacement.
 
-    One Gauss-Newton step from the common optimum for each draw (Efron and Tibshirani, An Introduction to
-    the Bootstrap, 1993, 6); every call makes the same draws.
+    This is the bootstrap (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, 6); every call
+    makes the same draws.
+    """
+    drawn = np.random.default_rng(0).multinomial(groups, np.full(groups, 1 / groups), size=draws)
+    return np.asarray(drawn, dtype=np.float64)
 
-    :param groups: the rows of T trials.
+
+def resampled(fit: Linearisation, groups: Sequence[Rows], prior: Floats,
+              counts: Floats) -> tuple[Floats, Floats]:
+    """
+    Return how far the optimum moves when groups of residuals count more or less, and how far by chance.
+
+    The first, (n, d), is a Gauss-Newton step from the common optimum; the second, (n, d), is the variance of
+    that step if the groups agree.  With information H_k, H = sum H_k, S = sum c_k H_k, it is the diagonal of
+    S^-1 (sum c_k^2 H_k - S H^-1 S) S^-1, as the gradients of the groups are independent, but add up to
+    zero.  It is large where few groups determine a parameter, and one of them is not counted.
+
+    :param groups: the rows of T groups.
     :param prior: (d, d) added to the information.
+    :param counts: (n, T) c, how often each group counts.
     """
     parts = [fit.rows(rows) for rows in groups]
     informations = np.array([part.information for part in parts])
     gradients = np.array([part.gradient for part in parts])
-    counts = np.random.default_rng(0).multinomial(len(parts), np.full(len(parts), 1 / len(parts)), size=draws)
-    matrices = np.tensordot(counts, informations, axes=1) + prior
-    moved: Floats = -np.linalg.solve(matrices, (counts @ gradients)[..., None])[..., 0]
-    return moved
+    counted = np.tensordot(counts, informations, axes=1)
+    inverses = np.linalg.inv(counted + prior)
+    moved: Floats = -(inverses @ (counts @ gradients)[..., None])[..., 0]
+    common = np.linalg.inv(fit.information + prior)
+    scatter = np.tensordot(counts**2, informations, axes=1) - counted @ common @ counted
+    return moved, np.asarray(np.einsum('nij,njk,nki->ni', inverses, scatter, inverses))
 
 
 def correlation_length(residuals: Floats, layout: ResidualLayout) -> float:

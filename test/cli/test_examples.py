@@ -34,7 +34,7 @@ def test_robot_session_sends_trials_starts_and_hears_the_result(ros_environment,
         process.send_signal(signal.SIGINT)
         assert ended(process) == 0
     assert heard.count('last refusal: none') == 4
-    assert 'calibrating on 4 trial(s), 5 evaluations' in heard
+    assert 'calibrating on 4 trial(s), at most 5 evaluations' in heard
     for name in ('flexibility', 'elasticity', 'friction', 'self_collision', 'calibration'):
         assert f'[robot]: {name}: ' in heard
     assert 'The simulated points are' in heard  # the findings

@@ -12,12 +12,13 @@ from dlo_calibration.evaluation.linearisation import Linearisation
 from dlo_calibration.evaluation.residuals import Huber, ResidualLayout
 from dlo_calibration.inference.uncertainty import (
     at_minimum,
-    bootstrap,
+    bootstrap_counts,
     correlation_length,
     jackknife,
     optimum_shift,
     predictive_std,
     prior_information,
+    resampled,
     spread_of_best,
     verdict,
 )
@@ -153,7 +154,7 @@ def test_where_the_model_is_wrong_the_disagreement_of_the_trials_counts():
     moved, residuals = fitted(jacobian, errors)
     noise_alone = at_minimum(Linearisation(POINT + moved, residuals, jacobian), LAYOUT, noise=1.0)
     uncertainty = at_minimum(Linearisation(POINT + moved, residuals, jacobian), LAYOUT, noise=1e-3)
-    assert uncertainty.std[0] > 1.5 * noise_alone.std[0]
+    assert uncertainty.std[0] > 1.4 * noise_alone.std[0]
     assert uncertainty.std[0] > 0.03
 
 
@@ -228,10 +229,28 @@ def test_trials_drawn_again_scatter_as_their_mean_does():
     values -= values.mean()
     jacobian = np.ones((30 * count, 1))
     fit = Linearisation(np.zeros(1), np.repeat(-values, 30), jacobian)
-    moved = bootstrap(fit, ResidualLayout(((2, 5),) * count).rows, np.zeros((1, 1)), draws=4000)
+    moved, by_chance = resampled(fit, ResidualLayout(((2, 5),) * count).rows, np.zeros((1, 1)),
+                                 bootstrap_counts(count, draws=4000))
     assert moved.shape == (4000, 1)
     assert moved.std() == pytest.approx(values.std() / np.sqrt(count), rel=0.05)
     assert moved.mean() == pytest.approx(0, abs=3e-4)
+    # With residuals of one standard deviation each, chance moves that mean by 1 / sqrt(30 T), less one of T.
+    assert by_chance.mean() == pytest.approx((count - 1) / count / (30 * count), rel=0.05)
+
+
+def test_trials_that_agree_move_the_optimum_as_far_as_chance_does_also_where_one_of_them_tells_most():
+    jacobian = linear_model()
+    for rows in LAYOUT.rows[1:]:
+        jacobian[rows, 0] *= 0.2
+    counts = np.concatenate([1 - np.eye(len(SHAPES)), bootstrap_counts(len(SHAPES), draws=20)])
+    squares, prior = [], 1e-9 * np.eye(jacobian.shape[1])
+    for draw in range(1000):
+        residuals = fitted(jacobian, np.random.default_rng(draw).normal(0, 1, ROWS))[1]
+        moved, by_chance = resampled(Linearisation(POINT, residuals, jacobian), LAYOUT.rows, prior, counts)
+        squares.append(moved**2)
+    determined = by_chance[:, 0] < 1e6  # not where a draw has the same trial four times
+    assert np.mean(squares, axis=0)[determined] == pytest.approx(by_chance[determined], rel=0.3, abs=1e-6)
+    assert by_chance[0, 0] > 5 * by_chance[1:4, 0].max()
 
 
 def test_a_parameter_without_effect_is_not_excited_and_can_be_anything():
