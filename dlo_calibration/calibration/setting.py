@@ -12,7 +12,7 @@ from typing import Callable
 
 from dlo_calibration.calibration.choice import Choice, choose, chooses_parts, hand_error, hand_warnings
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.errors import InputError, SimulationError
+from dlo_calibration.errors import SimulationError
 from dlo_calibration.evaluation.batch import BatchEvaluator
 from dlo_calibration.evaluation.evaluation import Evaluation, Evaluator
 from dlo_calibration.evaluation.log import Memory
@@ -52,11 +52,7 @@ class Setting:
 
     def __post_init__(self) -> None:
         evidence = GripEvidence.of(self.trials)
-        trials = evidence.usable(self.trials)
-        if not trials:
-            loss = evidence.losses[0]
-            raise InputError('calibration', f'no trial to use: in {loss.trial}, {loss.words}',
-                             'a trial in which the DLO follows the hands', 'repeat the trials')
+        trials = evidence.require_usable(self.trials)
         object.__setattr__(self, 'evidence', evidence)
         object.__setattr__(self, 'choice', choose(trials, self.options, evidence))
         object.__setattr__(self, 'options', self.choice.options)

@@ -70,7 +70,7 @@ def _fit(chosen: argparse.Namespace, source: Source, folder: CalibrationFolder |
     """Calibrate, print the result, and write its files."""
     from dlo_calibration.report.terminal import SearchBar
 
-    warnings: list[str] = []
+    warnings = list(source.trial_warnings)  # read_source has printed these
     log = None if folder is None else folder.log
 
     def warn_once(text: str) -> None:

@@ -40,14 +40,18 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     of_result = None if file is None else file.file_options
     source = read_source(selected(chosen), print_message, of_result).require_trials()
     result = None if file is None else validated(file, source.trials, source.options, make_simulator)
-    pictures = write_pictures(source.trials, None if result is None else result.chains, chosen.output,
-                              print_message, source.numbers)
+    trials = source.trials if result is None else result.trials
+    names = {trial.name for trial in trials}
+    numbers = [number for number, trial in zip(source.numbers, source.trials, strict=True)
+               if trial.name in names]
+    pictures = write_pictures(trials, None if result is None else result.chains, chosen.output,
+                              print_message, numbers)
     animations: list[Path] = []
     if chosen.animation and result is not None:
         physical = result.space.physical(result.values, result.length)
         with closing(make_simulator(source.options)) as simulator:
             animations = write_animations(result.trials, simulator, physical, chosen.output,
-                                          print_message, source.numbers)
+                                          print_message, numbers)
     if chosen.json:
         print_json({'pictures': [str(path) for path in pictures],
                     'animations': [str(path) for path in animations]})

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 import math
-from typing import Collection, Sequence
+from typing import Collection, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -143,6 +143,12 @@ class GripEvidence:
         return {name: min(max(value, -limits[name]), limits[name])
                 for name, value in self.estimates.items() if name in certain}
 
+    def other_than(self, values: Mapping[str, float]) -> dict[str, float]:
+        """Return the errors of the hands, 0 for none, that clearly differ from `values`, in their units."""
+        least = {name: SMALLEST_DELAY if name == 'hand_delay' else SMALLEST_SHIFT for name in self.estimates}
+        return {name: self.errors.get(name, 0.0) for name, estimate in self.estimates.items()
+                if abs(estimate - values.get(name, 0.0)) > max(least[name], CERTAIN * self.deviations[name])}
+
     def words(self, errors: Collection[str]) -> str:
         """Return the named errors in words; '' if the hands have none of them."""
         parts = []
@@ -170,6 +176,19 @@ class GripEvidence:
             elif goals and goals[-1].time >= trial.hands[0].start:  # else they show a DLO that nobody moved
                 used.append(replace(trial, goals=goals))
         return tuple(used)
+
+    def require_usable(self, trials: Sequence[Trial]) -> tuple[Trial, ...]:
+        """
+        Return what `usable` does.
+
+        :raises InputError: if nothing is left.
+        """
+        used = self.usable(trials)
+        if not used:
+            loss = self.losses[0]
+            raise InputError('calibration', f'no trial to use: in {loss.trial}, {loss.words}',
+                             'a trial in which the DLO follows the hands', 'repeat the trials')
+        return used
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@
 import argparse
 from dataclasses import replace
 from functools import cache
+import re
 
 from made_up_stream import MASS, messages, reversed_trial, TRUTH
 import numpy as np
@@ -131,6 +132,31 @@ def test_a_result_corrects_the_hands_of_the_trials_that_it_is_validated_on(tmp_p
     trials, _ = collected(messages(-0.08, (0.015, 0.0, 0.0)))
     options = Options(mass=MASS, engine='compiled', workers=1)
     assert validated(file, trials, options).errors.mean == pytest.approx(wrong.errors.mean, rel=1e-3)
+    right, _ = collected(messages())
+    elsewhere = validated(file, right, options)
+    assert elsewhere.errors.mean == pytest.approx(wrong.errors.mean, rel=0.2)
+    assert not elsewhere.unusable
+    assert [text.partition(':')[0] for text in elsewhere.warnings] == list(HANDS[:2])
+    assert set(elsewhere.parameters) == set(PHYSICS) | {HANDS[2]}
+    first, *others = right
+    missed = [replace(first, goals=tuple(replace(g, chain=first.initial) for g in first.goals)), *others]
+    assert [trial.name for trial in validated(file, missed, options).trials] == ['trial 2', 'trial 3']
+    with pytest.raises(InputError, match='no trial to use: in trial 1, hand has missed the DLO'):
+        validated(file, missed[:1], options)
+
+
+def test_a_result_is_not_usable_on_trials_of_another_dlo(tmp_path):
+    write_result(tmp_path / 'result.xml', fit())
+    file, options = read_result(tmp_path / 'result.xml'), Options(mass=MASS, engine='compiled', workers=1)
+    trials, _ = collected(messages())
+    assert not validated(file, trials, options).unusable
+    stiff = replace(file, parameters={**file.parameters, 'flexibility': replace(
+        file.parameters['flexibility'], value=10.0)})
+    assert re.match(r'the mean error is \d+\.?\d* times that of the calibration', validated(
+        stiff, trials, options).unusable)
+
+
+def test_a_result_with_given_errors_of_the_hands_keeps_them(tmp_path):
     given = fit((*PHYSICS,), late=-0.08, hand_delay=-0.08)
     write_result(tmp_path / 'fixed.xml', given)
     assert read_result(tmp_path / 'fixed.xml').physical()['hand_delay'] == pytest.approx(-0.08)
