@@ -89,7 +89,7 @@ def _with_errors(evidence: GripEvidence, file: Description) -> tuple[ParameterSp
     """
     Return the space of a result, with the errors that the hands have in other trials, and a warning for each.
 
-    Late clocks and shifted hands are none of the DLO, so another session may have other ones.
+    Late clocks and shifted hands are no property of the DLO: another session may have others.
     """
     space, physical = file.space, file.physical()
     errors = evidence.other_than(physical)

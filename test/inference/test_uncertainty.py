@@ -234,7 +234,7 @@ def test_trials_drawn_again_scatter_as_their_mean_does():
     assert moved.shape == (4000, 1)
     assert moved.std() == pytest.approx(values.std() / np.sqrt(count), rel=0.05)
     assert moved.mean() == pytest.approx(0, abs=3e-4)
-    # With residuals of one standard deviation each, chance moves that mean by 1 / sqrt(30 T), less one of T.
+    # With residuals of standard deviation 1, that mean has the variance (1 - 1 / T) / (30 T) by chance.
     assert by_chance.mean() == pytest.approx((count - 1) / count / (30 * count), rel=0.05)
 
 
