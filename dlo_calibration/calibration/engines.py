@@ -7,15 +7,14 @@ from __future__ import annotations
 
 import functools
 from importlib.util import find_spec
-import logging
 from typing import Any, Callable, Mapping
 
 from dlo_calibration.calibration.options import AUTO, Options
-from dlo_calibration.errors import InputError, printable
+from dlo_calibration.errors import InputError
 from dlo_calibration.evaluation.digest import code_digest, digest
 from dlo_calibration.evaluation.process_simulator import bullet_simulator, ProcessSimulator
 from dlo_calibration.simulation.protocol import Simulator
-from dlo_calibration.simulation.scene import read_scene
+from dlo_calibration.simulation.scene import Obstacle, read_scene
 
 #: Rooms whose code determines an evaluation: with another version of them, it may differ.
 DECISIVE = ('model', 'observation', 'simulation', 'evaluation')
@@ -30,29 +29,19 @@ class NoPyBullet(InputError):
 def _bullet(options: Options) -> Simulator:
     content = f'scene {options.scene}' if options.scene else 'trials'
     if find_spec('pybullet') is None:
-        raise NoPyBullet(content if options.scene else 'engine bullet', 'no PyBullet',
-                         'that library', 'install it: pip install pybullet')
-    obstacles = read_scene(options.scene) if options.scene else ()
-    make = functools.partial(bullet_simulator, engine_settings(options), obstacles)
+        raise NoPyBullet('engine bullet', 'no PyBullet', 'that library', 'install it: pip install pybullet')
+    make = functools.partial(bullet_simulator, engine_settings(options), _obstacles(options))
     return ProcessSimulator('bullet', make, content, options.answer_limit)
 
 
 def _compiled(options: Options) -> Simulator:
-    if options.scene:
-        raise InputError('engine compiled', f'scene {options.scene}', 'no scene: it simulates only a table',
-                         'use engine bullet or auto')
     from dlo_calibration.simulation.compiled import CompiledSimulator
 
-    return CompiledSimulator(**engine_settings(options))
+    return CompiledSimulator(obstacles=_obstacles(options), **engine_settings(options))
 
 
-def _auto(options: Options) -> Simulator:
-    """Return the compiled engine, or Bullet with a warning if there is a scene."""
-    if options.scene:
-        _warn_once('PyBullet simulates the evaluations, about 60 times slower, because engine compiled does '
-                   f'not support a scene: {options.scene}')
-        return _bullet(options)
-    return _compiled(options)
+def _obstacles(options: Options) -> tuple[Obstacle, ...]:
+    return read_scene(options.scene) if options.scene else ()
 
 
 def engine_settings(options: Options) -> dict[str, Any]:
@@ -68,19 +57,12 @@ def engine_digest(options: Options) -> str:
 
     :raises InputError: if the scene cannot be read.
     """
-    obstacles = read_scene(options.scene) if options.scene else ()
-    return digest(engine_settings(options), obstacles, code_digest(DECISIVE))
-
-
-@functools.cache
-def _warn_once(text: str) -> None:
-    """Log a warning, once per process."""
-    logging.getLogger(__name__).warning(printable(text))
+    return digest(engine_settings(options), _obstacles(options), code_digest(DECISIVE))
 
 
 #: name -> constructor, which imports its engine only when called
 ENGINES: Mapping[str, Callable[[Options], Simulator]] = {
-    AUTO: _auto,
+    AUTO: _compiled,
     'bullet': _bullet,
     'compiled': _compiled,
 }

@@ -228,8 +228,8 @@ class Options(DeclaredOptions):
     seed: int = declared(1, 'random seed; the same seed gives the same result', minimum=0, maximum=2**31 - 1,
                          of=SEARCH)
     engine: str = declared(
-        AUTO, 'simulation engine; auto: search with compiled and confirm the result with bullet, or use '
-        'bullet alone if there is a scene', choices=(AUTO, CONFIRMING, 'compiled'), of=SEARCH)
+        AUTO, 'simulation engine; auto: search with compiled and confirm the result with bullet',
+        choices=(AUTO, CONFIRMING, 'compiled'), of=SEARCH)
     workers: int = declared(0, 'number of threads that simulate; 0: one per core', minimum=0, maximum=1024,
                             of=MACHINE)
     scheduler: str = declared(

@@ -23,6 +23,7 @@ from dlo_calibration.simulation.protocol import (
     Rollout,
     TogetherSimulator,
 )
+from dlo_calibration.simulation.scene import core_scene, Obstacle
 from dlo_calibration.simulation.script import Script, Settling
 
 CACHE_SIZE = 1000  # prepared trials; a plan simulates each of its trials only once
@@ -146,10 +147,19 @@ class CompiledSimulator(Engine, TogetherSimulator):
     Threads may share it.
 
     A trial that grips more points than there are nodes is refused with an InputError.
+
+    :param obstacles: that the DLO touches.
+    :param settings: see `Engine`.
+    :raises InputError: if a mesh is not closed.
     """
 
     name = 'compiled'
     at_a_time = 48  # twelve for each lane, so that lanes are empty only towards the end
+
+    def __init__(self, *, obstacles: Sequence[Obstacle] = (), **settings: Any) -> None:
+        super().__init__(**settings)
+        self._obstacles = tuple(obstacles)
+        self._scene = core_scene(obstacles)
 
     def simulate_together(self, jobs: Sequence[Job], stop: core.Stop) -> list[Rollout | SimulationError]:
         """Simulate each job, four at a time; see `TogetherSimulator`."""
@@ -164,7 +174,7 @@ class CompiledSimulator(Engine, TogetherSimulator):
             else:
                 prepared.append(job)
                 packed.append((job.script.events, start, physical, NO_TABLE if level is None else level))
-        outcomes = iter(core.roll_out(packed, self._time_step, stop))
+        outcomes = iter(core.roll_out(packed, self._time_step, stop, scene=self._scene))
         for item in prepared:
             try:
                 if isinstance(item, SimulationError):
@@ -173,3 +183,11 @@ class CompiledSimulator(Engine, TogetherSimulator):
             except SimulationError as error:
                 rollouts.append(error)
         return rollouts
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the scene of the core, too, which is made again from the obstacles."""
+        return {name: value for name, value in super().__getstate__().items() if name != '_scene'}
+
+    def __setstate__(self, state: Mapping[str, Any]) -> None:
+        super().__setstate__(state)
+        self._scene = core_scene(self._obstacles)

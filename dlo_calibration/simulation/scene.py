@@ -22,13 +22,15 @@ import os
 from pathlib import Path
 import re
 import stat
-from typing import BinaryIO, Iterator, Mapping, TYPE_CHECKING
+from typing import BinaryIO, Iterator, Mapping, Sequence, TYPE_CHECKING
 from xml.etree import ElementTree
 
 import numpy as np
 
 from dlo_calibration.errors import InputError, shortened
 from dlo_calibration.model.chain import Floats, frozen_array
+from dlo_calibration.simulation import core
+from dlo_calibration.simulation.distance_grid import DistanceGrid
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -106,6 +108,31 @@ def read_scene(path: str) -> tuple[Obstacle, ...]:
     if not obstacles:
         raise unusable(path, 'no collision shape', 'add <collision> elements')
     return obstacles
+
+
+def core_scene(obstacles: Sequence[Obstacle]) -> core.Scene:
+    """
+    Return obstacles as bodies of the core; a mesh becomes a `DistanceGrid`.
+
+    :raises InputError: if a mesh is not closed.
+    """
+    return core.Scene([_body(obstacle) for obstacle in obstacles])
+
+
+def _body(obstacle: Obstacle) -> core.Body:
+    from scipy.spatial.transform import Rotation  # slow to load
+
+    turn = Rotation.from_quat(obstacle.turn).as_matrix().ravel()
+    if obstacle.shape != 'mesh':
+        halves = {'box': (0.5, 0.5, 0.5), 'sphere': (1.0,), 'cylinder': (0.5, 1.0), 'capsule': (0.5, 1.0)}
+        return core.Body(obstacle.shape, obstacle.sizes * halves[obstacle.shape], obstacle.position, turn,
+                         obstacle.friction)
+    try:
+        grid = DistanceGrid.of(obstacle.triangles * obstacle.sizes)
+    except ValueError as error:
+        raise InputError('scene', f'{error}', 'closed meshes', 'close it in the program that made it, or use '
+                         'engine bullet') from error
+    return core.Body.grid(grid.distances, grid.corner, grid.cell, obstacle.position, turn, obstacle.friction)
 
 
 def unusable(path: str, came: str, remedy: str = 'correct the file') -> InputError:

@@ -3,15 +3,16 @@
 
 """The choice of an engine: what each name gives, what it refuses, and its warnings."""
 
+from contextlib import closing
 import logging
 import pickle
 import sys
 
+import numpy as np
 import pytest
 from toy_messages import toy_trials
 
 from dlo_calibration import calibrate
-from dlo_calibration.calibration import engines
 from dlo_calibration.calibration.engines import ENGINES, make_simulator
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
@@ -25,7 +26,6 @@ BOX = ('<robot name="box"><link name="box"><collision><geometry><box size="0.1 0
 @pytest.fixture
 def warnings(caplog):
     """Give a function that returns the warnings so far, as of a new process."""
-    engines._warn_once.cache_clear()
     caplog.set_level(logging.WARNING, 'dlo_calibration')
     return lambda: [record.getMessage() for record in caplog.records]
 
@@ -68,19 +68,15 @@ def test_an_engine_that_was_sent_to_another_process_is_the_same_there(finer):
     assert sent.simulate(trial, physical).chains.tobytes() == expected
 
 
-def test_the_compiled_engine_refuses_a_scene_by_name(scene):
-    with pytest.raises(InputError) as refusal:
-        make_simulator(Options(engine='compiled', scene=scene))
-    assert str(refusal.value) == (f'engine compiled: scene {scene}; expected no scene: it simulates only '
-                                  'a table; use engine bullet or auto')
-
-
-@pytest.mark.pybullet
-def test_auto_simulates_a_scene_with_bullet_and_says_so_once(scene, warnings):
-    for _ in range(2):
-        assert make_simulator(Options(scene=scene)).name == 'bullet'
-    assert warnings() == [f'PyBullet simulates the evaluations, about 60 times slower, because engine '
-                         f'compiled does not support a scene: {scene}']
+@pytest.mark.parametrize('engine', ['auto', 'compiled'])
+def test_a_scene_is_simulated_by_the_compiled_engine(engine, scene, warnings):
+    trial, physical = toy_trials(1)[0], ParameterSpace().physical({}, 1.0)
+    with closing(make_simulator(Options(engine=engine, scene=scene))) as among:
+        assert among.name == 'compiled'
+        seen = among.simulate(trial, physical)
+    alone = make_simulator(Options()).simulate(trial, physical)
+    assert not np.allclose(seen.chains, alone.chains, atol=1e-3)
+    assert warnings() == []
 
 
 @pytest.mark.pybullet
@@ -103,13 +99,11 @@ def without_pybullet(monkeypatch):
     monkeypatch.setitem(sys.modules, 'pybullet', None)
 
 
-def test_without_pybullet_its_engine_and_scenes_are_refused_in_a_sentence(without_pybullet, scene):
-    for options, thing in ((Options(engine='bullet'), 'engine bullet'),
-                           (Options(scene=scene), f'scene {scene}')):
-        with pytest.raises(InputError) as refusal:
-            calibrate(toy_trials(1), options)
-        assert str(refusal.value) == (f'{thing}: no PyBullet; expected that library; '
-                                      'install it: pip install pybullet')
+def test_without_pybullet_its_engine_is_refused_in_a_sentence(without_pybullet):
+    with pytest.raises(InputError) as refusal:
+        calibrate(toy_trials(1), Options(engine='bullet'))
+    assert str(refusal.value) == ('engine bullet: no PyBullet; expected that library; '
+                                  'install it: pip install pybullet')
 
 
 def test_without_pybullet_a_result_is_not_confirmed_and_says_so(without_pybullet):

@@ -31,7 +31,9 @@ def rod_velocities(rod, points, velocities):
         across = max(slack, 0) * rod.stiffness[i]
         block = (rod.stiffness[i] - across) * np.outer(segment, segment) / (segment @ segment)
         ends = np.kron([[1, -1], [-1, 1]], block + across * np.eye(3))
-        matrix[3 * i:3 * i + 6, 3 * i:3 * i + 6] += rod.implicit * ends
+        taut = min(across * rod.step**2 / rod.masses[i:i + 2].min(), 1)
+        implicit = rod.implicit + taut * max(rod.step**2 - rod.implicit, 0)
+        matrix[3 * i:3 * i + 6, 3 * i:3 * i + 6] += implicit * ends
     if len(rod.angles):
         forces += frame_forces(points, rod)
     right = rod.masses[:, None] * velocities + rod.step * forces

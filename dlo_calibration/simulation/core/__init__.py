@@ -8,6 +8,17 @@ The core, in C++: simulates whole trials, four at a time, without Python's lock.
 header and one line of `step.hpp`.  `_core.pyi` documents the interface.
 """
 
-from dlo_calibration.simulation.core._core import Event, Grip, roll_out, Rope, Script, Start, Stop, TARGETS
+from dlo_calibration.simulation.core._core import (
+    Body,
+    Event,
+    Grip,
+    roll_out,
+    Rope,
+    Scene,
+    Script,
+    Start,
+    Stop,
+    TARGETS,
+)
 
-__all__ = ['Event', 'Grip', 'Rope', 'Script', 'Start', 'Stop', 'TARGETS', 'roll_out']
+__all__ = ['Body', 'Event', 'Grip', 'Rope', 'Scene', 'Script', 'Start', 'Stop', 'TARGETS', 'roll_out']

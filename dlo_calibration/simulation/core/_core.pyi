@@ -89,6 +89,40 @@ class Script:
 
     def __init__(self, events: Sequence[Event], stable_distance: float, stable_steps: int) -> None: ...
 
+class Body:
+    """
+    A body that does not move.
+
+    :param shape: sphere, box, cylinder or capsule.
+    :param sizes: [m] radius of a sphere; (3,) half edges of a box; half length and radius of a cylinder or
+        capsule along z.
+    :param position: (3,) [m] of its centre.
+    :param turn: (9,) rotation from its frame to that of the world, row by row.
+    :param friction: coefficient that multiplies that of the DLO.
+    """
+
+    def __init__(self, shape: str, sizes: ArrayLike, position: ArrayLike, turn: ArrayLike, friction: float
+                 ) -> None: ...
+
+    @staticmethod
+    def grid(distances: ArrayLike, corner: ArrayLike, cell: float, position: ArrayLike, turn: ArrayLike,
+             friction: float) -> Body:
+        """
+        Return a body of any shape, by the signed distances from its surface at the points of a grid.
+
+        :param distances: (x, y, z) [m], single precision.
+        :param corner: (3,) [m] of the first point, in the frame of the body.
+        :param cell: [m] from a point to the next.
+        """
+
+    def distance(self, at: ArrayLike) -> float:
+        """Return the signed distance [m] of a point (3,) [m] from the surface; negative inside."""
+
+class Scene:
+    """Bodies that a DLO touches; it is its friction times theirs that rubs."""
+
+    def __init__(self, bodies: Sequence[Body]) -> None: ...
+
 class Stop:
     """A flag that one thread sets to end `roll_out` in others within some milliseconds."""
 
@@ -96,7 +130,7 @@ class Stop:
     def is_set(self) -> bool: ...
 
 def roll_out(jobs: Sequence[tuple[Script, Start, Mapping[str, float], float]], time_step: float,
-             stop: Stop | None = None, target: str = ''
+             stop: Stop | None = None, target: str = '', scene: Scene | None = None
              ) -> list[tuple[NDArray[np.float64], tuple[bool, ...], int] | None]:
     """
     Simulate jobs.  Any number of threads may call this; an outcome does not depend on the other jobs.
@@ -105,6 +139,7 @@ def roll_out(jobs: Sequence[tuple[Script, Start, Mapping[str, float], float]], t
         the table.
     :param time_step: [s].
     :param target: one of `TARGETS`; empty: the fastest.
+    :param scene: around the DLO of each job; None: nothing.
     :returns: for each job the nodes at the goals (g, N, 3) [m], whether the DLO was stable at each goal that
         is a stable configuration (else True), and the number of steps; None if the rollout diverged.  After
         a stop, outcomes are meaningless.
@@ -118,6 +153,7 @@ class Rope:
     :param time_step: [s].
     :param level: height [m] of nodes that touch the table.
     :param gravity: (3,) [m/s^2].
+    :param scene: that `step` keeps it out of; None: nothing.
     """
 
     #: (N, 3) [m], [m/s]: state; `predicted`: velocities without contact with other bodies; `support`: change
@@ -137,7 +173,7 @@ class Rope:
     state: dict[str, Any]
 
     def __init__(self, start: Start, physical: Mapping[str, float], time_step: float, level: float,
-                 gravity: ArrayLike) -> None: ...
+                 gravity: ArrayLike, scene: Scene | None = None) -> None: ...
     def hold(self, nodes: Sequence[int]) -> None:
         """Hold exactly these nodes from now on; a segment between two of them is rigid."""
 
@@ -154,7 +190,7 @@ class Rope:
         """Compute `predicted`; return whether it is finite."""
 
     def step(self) -> bool:
-        """Take a step on the table; return whether the rope is still finite."""
+        """Take a step on the table and in the scene; return whether the rope is still finite."""
 
     def follow(self, script: Script, step: Callable[[], Any]
                ) -> tuple[NDArray[np.float64], tuple[bool, ...], int] | None:

@@ -9,6 +9,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <map>
 #include <optional>
 #include <sstream>
 
@@ -21,7 +22,7 @@ namespace dlo {
 namespace {
 
 using Array = py::array_t<double, py::array::c_style | py::array::forcecast>;
-constexpr std::size_t kMostNodes = 10000;  // the table of distances of segments grows with their square
+constexpr std::size_t kMostBodies = 2000, kMostGridPoints = 1 << 24;
 constexpr int kFewestStableSteps = 5, kMostStableSteps = 100000000;  // there are five checks within them
 
 /// Raise a ValueError with a text, "thing: what came; expected what; remedy", unless a condition holds.
@@ -117,7 +118,7 @@ Start make_start(const Array& places, const Array& points, const Array& velociti
               rows<Point>("velocities", velocities), rows<double>("features", features),
               rows<Point>("directions", directions, false)};
   const std::size_t n = start.places.size();
-  require(n > 2 && n <= kMostNodes, "start: ", n, " nodes; expected 3 to ", kMostNodes,
+  require(n > 2 && n <= std::size_t{kMostNodes}, "start: ", n, " nodes; expected 3 to ", kMostNodes,
           "; choose another number of nodes");
   require(start.points.size() == n && start.velocities.size() == n &&
               (start.features.empty() || start.features.size() == n) &&
@@ -132,7 +133,7 @@ Start make_start(const Array& places, const Array& points, const Array& velociti
 
 std::vector<int> checked_nodes(std::vector<int> nodes) {
   for (int node : nodes)
-    require(node >= 0 && node < static_cast<int>(kMostNodes), "nodes: ", node, "; expected 0 to ",
+    require(node >= 0 && node < kMostNodes, "nodes: ", node, "; expected 0 to ",
             kMostNodes - 1, "; give the index of a node");
   return nodes;
 }
@@ -211,6 +212,72 @@ Script make_script(std::vector<std::shared_ptr<const Event>> events, double dist
   return script;
 }
 
+/// Sizes [m] of a body by shape, as `Body` has them, and how far it reaches from its position.
+Body make_body(const std::string& shape, const Array& sizes, const Array& position, double friction) {
+  static const std::map<std::string, std::pair<Shape, py::ssize_t>> shapes = {
+      {"sphere", {Shape::kSphere, 1}}, {"box", {Shape::kBox, 3}}, {"cylinder", {Shape::kCylinder, 2}},
+      {"capsule", {Shape::kCapsule, 2}}};
+  const auto entry = shapes.find(shape);
+  require(entry != shapes.end(), "shape: ", shape, "; expected sphere, box, cylinder or capsule; use a grid");
+  require(sizes.size() == entry->second.second, "sizes: ", sizes.size(), " numbers; expected ",
+          entry->second.second, " of a ", shape, "; give as many");
+  Body body{entry->second.first, {}, point("position", position), {}, friction, 0.0, {}, {}, {}};
+  for (py::ssize_t k = 0; k < sizes.size(); ++k) {
+    body.sizes[k] = sizes.data()[k];
+    require(body.sizes[k] > 0.0 && std::isfinite(body.sizes[k]), "sizes: ", body.sizes[k],
+            " m; expected a positive finite number; replace it");
+  }
+  const auto& [a, b, c] = body.sizes;
+  body.reach = body.shape == Shape::kSphere ? a : body.shape == Shape::kBox ? std::sqrt(a * a + b * b + c * c)
+               : body.shape == Shape::kCylinder ? std::sqrt(a * a + b * b) : a + b;
+  return body;
+}
+
+Body with_pose(Body body, const Array& turn, double friction) {
+  require(turn.size() == 9 && all_finite(turn), "turn: ", turn.size(), " numbers; expected the 9 finite "
+          "ones of a rotation matrix; give them row by row");
+  std::copy_n(turn.data(), 9, body.turn.data());
+  require(friction >= 0.0 && std::isfinite(friction), "friction: ", friction,
+          "; expected a finite number, 0 or more; replace it");
+  return body;
+}
+
+std::shared_ptr<Body> make_grid(const py::array_t<float, py::array::c_style | py::array::forcecast>& distances,
+                                const Array& corner, double cell, const Array& position, const Array& turn,
+                                double friction) {
+  require(distances.ndim() == 3 && distances.size() <= static_cast<py::ssize_t>(kMostGridPoints),
+          "distances: ", distances.ndim(), " dimensions and ", distances.size(), " numbers; expected 3, and at "
+          "most ", kMostGridPoints, "; choose a larger cell");
+  require(cell > 0.0 && std::isfinite(cell), "cell: ", cell, " m; expected a positive finite number; replace it");
+  Body body{Shape::kGrid, {cell, 0.0, 0.0}, point("position", position), {}, friction, 0.0,
+            point("corner", corner), {}, {distances.data(), distances.data() + distances.size()}};
+  Point furthest{};
+  for (int c = 0; c < 3; ++c) {
+    body.counts[c] = static_cast<int>(distances.shape(c));
+    require(body.counts[c] > 1, "distances: ", body.counts[c], " points in one direction; expected 2 or more; "
+            "choose a smaller cell");
+    double& from = c == 0 ? furthest.x : c == 1 ? furthest.y : furthest.z;
+    from = corner.data()[c];
+    const double to = from + cell * (body.counts[c] - 1);
+    from = std::max(std::abs(from), std::abs(to));
+  }
+  for (float distance : body.distances)
+    require(std::isfinite(distance), "distances: a number that is not finite; expected finite ones; replace it");
+  body.reach = std::sqrt(furthest.x * furthest.x + furthest.y * furthest.y + furthest.z * furthest.z);
+  return std::make_shared<Body>(with_pose(std::move(body), turn, friction));
+}
+
+std::shared_ptr<Scene> make_scene(const std::vector<std::shared_ptr<const Body>>& bodies) {
+  require(bodies.size() <= kMostBodies, "bodies: ", bodies.size(), "; expected at most ", kMostBodies,
+          "; leave some out");
+  auto scene = std::make_shared<Scene>();
+  for (const auto& body : bodies) {
+    require(body != nullptr, "bodies: None; expected a Body; leave it out");
+    scene->bodies.push_back(*body);
+  }
+  return scene;
+}
+
 void require_step(double step) {
   require(step > 0.0 && std::isfinite(step), "time_step: ", step,
           " s; expected a positive finite time; choose another time step");
@@ -239,7 +306,7 @@ py::object answer(const Outcome& outcome) {
 }
 
 py::list roll_out(const std::vector<JobTuple>& tuples, double time_step, const Stop* stop,
-                  const std::string& name) {
+                  const std::string& name, const std::shared_ptr<const Scene>& scene) {
   static const Stop never;
   const auto target = std::find_if(targets().begin(), targets().end(), [&](const Target& candidate) {
     return name.empty() || name == candidate.name;
@@ -251,7 +318,7 @@ py::list roll_out(const std::vector<JobTuple>& tuples, double time_step, const S
     require(script && start, "jobs: None; expected a Script and a Start; leave the job out");
     require_fit(*script, start->points.size());
     require_finite("level", level);
-    jobs.push_back({script, start, properties_of(physical), time_step, level});
+    jobs.push_back({script, start, properties_of(physical), time_step, level, scene});
   }
   std::vector<Outcome> outcomes;
   {
@@ -309,13 +376,13 @@ py::dict state_of(const Rope& rope) {
 void define_rope(py::module_& module) {
   py::class_<Rope> type(module, "Rope", py::module_local());
   type.def(py::init([](const Start& start, const py::object& physical, double time_step, double level,
-                       const Array& gravity) {
+                       const Array& gravity, std::shared_ptr<const Scene> scene) {
              require_step(time_step);
              require_finite("level", level);
              return std::make_unique<Rope>(start, properties_of(physical), time_step,
-                                           point("gravity", gravity), level);
+                                           point("gravity", gravity), level, std::move(scene));
            }),
-           "start"_a, "physical"_a, "time_step"_a, "level"_a, "gravity"_a);
+           "start"_a, "physical"_a, "time_step"_a, "level"_a, "gravity"_a, "scene"_a = py::none());
   const auto share = [&](const char* name, auto member) {
     type.def_property_readonly(name, [member](const py::object& self) {
       return array_of(member(self.cast<Rope&>()), self);
@@ -364,10 +431,22 @@ PYBIND11_MODULE(_core, module) {
       .def_static("see", &make_see, "share"_a = py::none());
   py::class_<Script, std::shared_ptr<Script>>(module, "Script", py::module_local())
       .def(py::init(&make_script), "events"_a, "stable_distance"_a, "stable_steps"_a);
+  py::class_<Body, std::shared_ptr<Body>>(module, "Body", py::module_local())
+      .def(py::init([](const std::string& shape, const Array& sizes, const Array& position, const Array& turn,
+                       double friction) {
+             return std::make_shared<Body>(
+                 with_pose(make_body(shape, sizes, position, friction), turn, friction));
+           }),
+           "shape"_a, "sizes"_a, "position"_a, "turn"_a, "friction"_a)
+      .def_static("grid", &make_grid, "distances"_a, "corner"_a, "cell"_a, "position"_a, "turn"_a, "friction"_a)
+      .def("distance", [](const Body& body, const Array& at) { return distance(body, point("at", at)); }, "at"_a);
+  py::class_<Scene, std::shared_ptr<Scene>>(module, "Scene", py::module_local())
+      .def(py::init(&make_scene), "bodies"_a);
   py::class_<Stop>(module, "Stop", py::module_local())
       .def(py::init())
       .def("set", [](Stop& stop) { stop.flag = true; })
       .def("is_set", [](const Stop& stop) { return stop.flag.load(); });
   define_rope(module);
-  module.def("roll_out", &roll_out, "jobs"_a, "time_step"_a, "stop"_a = nullptr, "target"_a = "");
+  module.def("roll_out", &roll_out, "jobs"_a, "time_step"_a, "stop"_a = nullptr, "target"_a = "",
+             "scene"_a = py::none());
 }

@@ -12,8 +12,11 @@
 // Simulation, 1998, equation 6.  For one mode of a linear spring, every c >= dt^2 / 2 is stable at any
 // stiffness, and the determinant shows that c damps the mode like a stiffness-proportional damping of c / dt.
 // So c is dt times the internal damping, but at least 0.6 dt^2 for stability (at 0.5 dt^2 the stiffest modes
-// would ring for ever); at this limit the damping depends on the time step.  The negative part of the matrix
-// of a compressed spring is omitted, so that the whole matrix stays positive definite.
+// would ring for ever); at this limit the damping depends on the time step.  That holds for small movements
+// alone: a taut DLO that vibrates across turns its stiff springs within a step, and gains energy until it
+// flies away.  With c = dt^2 it does not; so the springs get that where the tension would move a node by the
+// length of a segment within a step, T dt^2 / (l m) >= 1, and a share of it with less tension.  The negative
+// part of the matrix of a compressed spring is omitted, so that the whole matrix stays positive definite.
 
 namespace dlo {
 namespace DLO_TARGET {
@@ -26,7 +29,8 @@ inline void find_springs(Rods<Number>& rods) {
   const int segments = rods.nodes - 1;
   const bool framed = rods.framed;
   const double step = rods.step;
-  const Number implicit = rods.implicit;
+  const Number implicit = rods.implicit, missing = max(step * step - implicit, 0.0);
+  const auto* masses = rods.masses.data();
   const auto *points = rods.points.data();
   const auto *rest_lengths = rods.rest_lengths.data(), *stiffnesses = rods.stiffness.data();
   auto* springs = rods.springs.data();
@@ -37,7 +41,9 @@ inline void find_springs(Rods<Number>& rods) {
     const Number inverse = 1.0 / sqrt(dot(segment, segment)), stiffness = stiffnesses[i];
     const Number slack = 1.0 - rest_lengths[i] * inverse;
     const Number across = max(slack, 0.0) * stiffness;
-    springs[i] = {across * implicit, implicit * (stiffness - across) * inverse * inverse,
+    const Number taut = min(across * (step * step) / min(masses[i], masses[i + 1]), 1.0);
+    const Number part = implicit + taut * missing;
+    springs[i] = {across * part, part * (stiffness - across) * inverse * inverse,
                   stiffness * slack * step};
     if (framed) tangents[i] = inverse * segment, inverse_lengths[i] = inverse;
   }
@@ -60,7 +66,8 @@ inline void eliminate(const Column<Number>& done, const std::array<Number, kBand
 
 /// Write the equations of a step and solve them by L D L^T (Golub and Van Loan, Matrix Computations, 4.3).
 ///
-/// `strand_forces` and `frame_impulses` add the other internal forces, `holding` holds nodes.  The solution
+/// `strand_forces` and `frame_impulses` add the other internal forces, `holding` holds nodes, `touching` keeps
+/// them out of bodies.  The solution
 /// is written to `predicted`, and whether it is finite to `solved`.  Each column is computed in one pass from
 /// the six before it.  The last one stays in registers, so that the next pivot never waits for memory.
 template <class Number>
@@ -76,7 +83,7 @@ inline void solve(Rods<Number>& rods) {
   const auto* strand_forces = rods.strand_forces.data();
   const auto* frame_impulses = rods.frame_impulses.data();
   const auto* holdings = rods.holding.data();
-  const auto* any_held = rods.any_held.data();
+  const auto *any_held = rods.any_held.data(), *any_touching = rods.any_touching.data();
   auto* predicted = rods.predicted.data();
   Column<Number>* columns = rods.columns.data() + kBand - 1;
   const Point fall = step * rods.gravity;
@@ -138,9 +145,19 @@ inline void solve(Rods<Number>& rods) {
       dx = dx + holding.weight, dy = dy + holding.weight, dz = dz + holding.weight;
       impulse = impulse + holding.impulse;
     }
-    next(result.x, impulse.x, dx, bxy + xy, bxz + xz, first - xx, -xy, -xz, second);
-    next(result.y, impulse.y, dy, byz + yz, -xy, first - yy, -yz, none, second);
-    next(result.z, impulse.z, dz, -xz, -yz, first - zz, none, none, second);
+    Number dxy = bxy + xy, dxz = bxz + xz, dyz = byz + yz;
+    Number nxx = first - xx, nyy = first - yy, nzz = first - zz, nxy = -xy, nxz = -xz, nyz = -yz;
+    if (any_touching[i]) {
+      const auto& [own, next_node, push] = rods.touching[i];
+      dx = dx + own[0], dxy = dxy + own[1], dxz = dxz + own[2];
+      dy = dy + own[3], dyz = dyz + own[4], dz = dz + own[5];
+      nxx = nxx + next_node[0], nxy = nxy + next_node[1], nxz = nxz + next_node[2];
+      nyy = nyy + next_node[3], nyz = nyz + next_node[4], nzz = nzz + next_node[5];
+      impulse = impulse + push;
+    }
+    next(result.x, impulse.x, dx, dxy, dxz, nxx, nxy, nxz, second);
+    next(result.y, impulse.y, dy, dyz, nxy, nyy, nyz, none, second);
+    next(result.z, impulse.z, dz, nxz, nyz, nzz, none, none, second);
   }
   Number total = none;
   last = {};

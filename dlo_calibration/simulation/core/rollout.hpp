@@ -157,7 +157,7 @@ class Rollout {
 /// A rollout with its own rope; its steps are taken together with those of others.
 struct LaneRollout {
   LaneRollout(const Job& job, Outcome& outcome)
-      : rope(*job.start, job.properties, job.step, {0.0, 0.0, -kGravity}, job.level),
+      : rope(*job.start, job.properties, job.step, {0.0, 0.0, -kGravity}, job.level, job.scene),
         rollout(*job.script, rope, outcome) {}
 
   /// Go on to steps that can be taken together with others; return whether there are any.  The first step of

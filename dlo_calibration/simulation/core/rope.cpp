@@ -31,7 +31,8 @@ double between(double place, const std::vector<double>& places, const std::vecto
 
 }  // namespace
 
-Rope::Rope(const Start& start, const Properties& properties, double step, Point gravity, double level)
+Rope::Rope(const Start& start, const Properties& properties, double step, Point gravity, double level,
+           std::shared_ptr<const Scene> scene)
     : properties_(properties) {
   const int n = static_cast<int>(start.points.size()), segments = n - 1;
   rods.nodes = n, rods.step = step, rods.gravity = gravity, rods.level = level;
@@ -71,6 +72,11 @@ Rope::Rope(const Start& start, const Properties& properties, double step, Point 
   for (Spheres* spheres : {&contact.single, &contact.twin})
     for (auto* row : {&spheres->x, &spheres->y, &spheres->z, &spheres->radius}) row->resize(segments);
   begin(contact, rods.points.data());
+  if (scene && !scene->bodies.empty()) {
+    surroundings.scene = std::move(scene);
+    surroundings.radius = properties.radius, surroundings.friction = properties.friction;
+    begin(surroundings, rods.points.data(), n);
+  }
 
   if (!start.directions.empty() && !properties.rest_curvature.empty()) {
     directions_ = start.directions;
@@ -193,6 +199,8 @@ bool predict(Rope& rope) {
   predict(rope.rods, {&rope});
   return rope.rods.solved == 1.0;
 }
+
+double distance(const Body& body, const Point& at) { return field_of(body, at).distance; }
 
 bool take_step(Rope& rope) {
   take_step(rope.rods, {&rope});

@@ -6,41 +6,13 @@
 #pragma once
 
 #include <array>
+#include <memory>
 #include <vector>
 
+#include "scene.hpp"
+#include "vectors.hpp"
+
 namespace dlo {
-
-// A Number is a double, or the doubles of four DLOs in SIMD lanes (`Lanes`).
-
-constexpr int kLanes = 4;  // DLOs that are stepped together
-
-/// How many DLOs a number belongs to.
-template <class Number>
-constexpr int lanes_of = sizeof(Number) / sizeof(double);
-
-/// The number in one lane.
-template <class Number>
-inline double& in_lane(Number& number, int k) {
-  return reinterpret_cast<double*>(&number)[k];
-}
-
-template <class Number>
-struct Vec3 {
-  Number x, y, z;
-};
-
-using Point = Vec3<double>;
-using Matrix = std::array<double, 9>;  // row by row
-
-template <class Number>
-inline Point in_lane(Vec3<Number>& v, int k) {
-  return {in_lane(v.x, k), in_lane(v.y, k), in_lane(v.z, k)};
-}
-
-template <class Number>
-inline void set_lane(Vec3<Number>& v, int k, const Point& to) {
-  in_lane(v.x, k) = to.x, in_lane(v.y, k) = to.y, in_lane(v.z, k) = to.z;
-}
 
 constexpr int kBand = 7;  // entries per column of the lower triangle: node i is coupled with node i + 2
 
@@ -137,6 +109,8 @@ struct Rods {
   std::vector<Vec3<Number>> frame_impulses;  // [N s]
   std::vector<Holding<Number>> holding;
   std::vector<char> any_held;  // whether this node is held in any lane
+  std::vector<Touching<Number>> touching;
+  std::vector<char> any_touching;  // whether `touching` has something at this node in any lane
   std::vector<Vec3<Number>> tangents, across;
   std::vector<Number> inverse_lengths, clamped, prescribed, turning, upper;
   std::vector<StrandForce<Number>> strand_forces;
@@ -152,6 +126,7 @@ struct Rods {
     masses.resize(n), bending.resize(n), springs.resize(n);
     columns.assign(kBand - 1 + 3 * n, Column<Number>{});
     holding.resize(n), any_held.assign(n, false);
+    touching.resize(n), any_touching.assign(n, false);
     for (auto* each : {&angles, &inverse_lengths, &clamped, &prescribed, &turning, &upper})
       each->resize(framed ? segments : 0);
     for (auto* each : {&tangents, &across}) each->resize(framed ? segments : 0);
@@ -254,7 +229,8 @@ struct Clamp {
 
 class Rope {
  public:
-  Rope(const Start& start, const Properties& properties, double step, Point gravity, double level);
+  Rope(const Start& start, const Properties& properties, double step, Point gravity, double level,
+       std::shared_ptr<const Scene> scene);
 
   /// Hold exactly these nodes from now on: they go to `targets`.  A segment between two of them is rigid, so
   /// that bending begins where a clamped DLO leaves its clamp.
@@ -265,6 +241,7 @@ class Rope {
 
   Rods<double> rods;
   SelfContact contact;
+  SceneContact surroundings;
   std::vector<int> held;
   std::vector<Point> targets, hand_velocities;  // of held nodes: after the coming step [m]; in it [m/s]
   std::vector<Matrix> turns;           // of their hands in the coming step; empty: clamps turn with segments
@@ -290,5 +267,8 @@ bool predict(Rope& rope);
 
 /// Take a step on a table; return whether the rope is still finite.
 bool take_step(Rope& rope);
+
+/// The signed distance [m] of a point from the surface of a body.
+double distance(const Body& body, const Point& at);
 
 }  // namespace dlo

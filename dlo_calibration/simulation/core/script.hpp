@@ -83,6 +83,7 @@ struct Job {
   Properties properties;
   double step;   // [s]
   double level;  // height of nodes that touch the table [m]
+  std::shared_ptr<const Scene> scene;  // around it; none: nothing
 };
 
 /// The result of a rollout.

@@ -7,6 +7,7 @@
 #include "rod.hpp"
 #include "strands.hpp"
 #include "frame.hpp"
+#include "scene_contact.hpp"
 
 namespace dlo {
 namespace DLO_TARGET {
@@ -75,7 +76,9 @@ void predict(Rods<Number>& rods, const Ropes& ropes) {
     ropes[0]->frame_begun = true;
   }
   hold(rods, ropes);
-  solve(rods);
+  const auto has_scene = [](const Rope* rope) { return rope->surroundings.scene != nullptr; };
+  if (std::any_of(ropes.begin(), ropes.end(), has_scene)) solve_among_bodies(rods, ropes);
+  else solve(rods);
   each_held(ropes, [&](int lane, int node, const Point& velocity, const Point&) {
     set_lane(rods.predicted[node], lane, velocity);
   });
@@ -83,15 +86,19 @@ void predict(Rods<Number>& rods, const Ropes& ropes) {
   rods.next_moves = movement(rods.predicted, step);
   for (std::size_t lane = 0; lane < ropes.size(); ++lane) {
     turn_clamps(*ropes[lane]);
-    if (in_lane(rods.solved, lane) == 1.0) avoid_self_contact(rods, *ropes[lane], lane);
+    if (in_lane(rods.solved, lane) != 1.0) continue;
+    avoid_self_contact(rods, *ropes[lane], static_cast<int>(lane));
+    keep_out(rods, *ropes[lane], static_cast<int>(lane));
   }
 }
 
-/// Take a step on a table.
+/// Take a step on a table, among the bodies of a scene.
 template <class Number>
 void take_step(Rods<Number>& rods, const Ropes& ropes) {
   predict(rods, ropes);
   step_on_table(rods);
+  for (std::size_t lane = 0; lane < ropes.size(); ++lane)
+    add_support(rods, *ropes[lane], static_cast<int>(lane));
   each_held(ropes, [&](int lane, int node, const Point& velocity, const Point& target) {
     set_lane(rods.velocities[node], lane, velocity);
     set_lane(rods.support[node], lane, {0.0, 0.0, 0.0});

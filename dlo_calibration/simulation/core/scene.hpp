@@ -1,0 +1,67 @@
+// SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+// SPDX-License-Identifier: Apache-2.0
+// Scene: fixed bodies that the DLO touches, and what a DLO keeps about its contact with them.
+
+#pragma once
+
+#include <array>
+#include <memory>
+#include <utility>
+#include <vector>
+
+#include "vectors.hpp"
+
+namespace dlo {
+
+enum class Shape { kSphere, kBox, kCylinder, kCapsule, kGrid };
+
+/// A body that does not move.
+struct Body {
+  Shape shape;
+  std::array<double, 3> sizes;  // [m] radius; half edges; half length and radius along z; or cell of the grid
+  Point position;               // [m] of its frame
+  Matrix turn;                  // from its frame to that of the world
+  double friction;
+  double reach;                 // [m] from `position` to the point furthest away
+  Point corner{};               // first point of the grid [m], in its frame
+  std::array<int, 3> counts{};  // of the grid's points
+  std::vector<float> distances;  // signed [m], at the grid's points, z fastest
+};
+
+struct Scene {
+  std::vector<Body> bodies;
+};
+
+/// A place of the DLO that touches a body, or may do so in this step: a node, or a point between two nodes.
+struct Touch {
+  int body, node;
+  bool between;                 // it lies between this node and the next
+  std::array<double, 2> weights;  // of these two nodes
+  Point normal;                 // from the body to the DLO
+  double mobility;              // velocity per impulse [1/kg]
+  double least;                 // least velocity along the normal [m/s]
+  bool pushes = false;          // the body pushes the DLO
+  double push = 0.0;            // impulse along the normal [N s]
+  double drag = 0.0;            // friction: impulse against the sliding, per velocity [kg]
+  Point impulse{};              // all of it in the last solution [N s]
+};
+
+/// Contact is that of the capsules around the segments, so that nothing passes between two nodes.  What lies in
+/// a body at the start may stay there until it has left: a radius that is too large does not throw the DLO away.
+struct SceneContact {
+  std::shared_ptr<const Scene> scene;
+  double radius = 0.0, friction = 0.0;
+  std::vector<double> allowed;             // [m] least gap, for each body at each node and between two nodes
+  std::vector<std::pair<int, int>> near;   // bodies and segments whose gap is within the Verlet skin
+  double room = -1.0;                      // [m] that any node may move until `near` is out of date
+  std::vector<Touch> touches, former;      // sorted by body, node and `between`
+};
+
+/// What bodies add to the equations of a node and the next one: a symmetric matrix each, xx xy xz yy yz zz.
+template <class Number>
+struct Touching {
+  std::array<Number, 6> own, next;  // [kg]
+  Vec3<Number> impulse;             // [N s]
+};
+
+}  // namespace dlo

@@ -1,0 +1,388 @@
+// SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+// SPDX-License-Identifier: Apache-2.0
+// The contact of a DLO with the fixed bodies of a scene in a step.
+//
+// Contact is part of the implicit equations, as a hand is: a body that pushes adds n . v = v_n with a large
+// weight.  Impulses found after the solution instead would reach the neighbouring nodes a step late, so that
+// the tension along a DLO around a peg would be wrong.  Coulomb friction is a drag of mu p / |v_t| against the
+// sliding velocity v_t, p being the impulse along the normal: a symmetric term, which only takes energy.
+// Which bodies push, and v_t, come from the last solution; where they change, the equations are solved again
+// (an active set, and iteratively reweighted friction).
+
+namespace dlo {
+namespace DLO_TARGET {
+
+constexpr double kRigid = 1e6;        // weight of the equation of a contact, relative to the mass that it moves
+constexpr double kCreep = 1e-6;       // m/s; slower sliding counts as none
+constexpr double kFrictionError = 0.1;  // share of the friction by which it may be late
+constexpr int kSolutions = 4, kMostSolutions = 10;  // of the equations of a step; the later ones only release
+constexpr double kLeft = 1e-4;        // m; a gap with which the DLO has left a body
+constexpr double kCorrected = 0.08;   // share of a penetration that one step corrects, as on the table
+constexpr double kAllowed = 1e-5;     // m of penetration, as on the table
+
+/// The signed distance [m] of a point from the surface of a body, and its gradient.
+struct Field {
+  double distance;
+  Point gradient;
+};
+
+/// The vector with length 1; that of `otherwise` if it has no direction.
+inline Field of_length(const Point& away, double less, const Point& otherwise) {
+  const double length = sqrt(dot(away, away));
+  if (!(length > kTiny)) return {length - less, otherwise};
+  return {length - less, {away.x / length, away.y / length, away.z / length}};
+}
+
+inline double sign_of(double x) { return x < 0.0 ? -1.0 : 1.0; }
+
+inline Field box_field(const Point& p, const Point& half) {
+  const Point beyond = {abs(p.x) - half.x, abs(p.y) - half.y, abs(p.z) - half.z};
+  if (beyond.x <= 0.0 && beyond.y <= 0.0 && beyond.z <= 0.0) {  // inside: out of the nearest face
+    if (beyond.x >= beyond.y && beyond.x >= beyond.z) return {beyond.x, {sign_of(p.x), 0.0, 0.0}};
+    if (beyond.y >= beyond.z) return {beyond.y, {0.0, sign_of(p.y), 0.0}};
+    return {beyond.z, {0.0, 0.0, sign_of(p.z)}};
+  }
+  const auto outside = [](double b, double x) { return b > 0.0 ? b * sign_of(x) : 0.0; };
+  return of_length({outside(beyond.x, p.x), outside(beyond.y, p.y), outside(beyond.z, p.z)}, 0.0,
+                   {0.0, 0.0, 1.0});
+}
+
+/// A cylinder is a box in the plane of its axis and the point.
+inline Field cylinder_field(const Point& p, double half, double radius) {
+  const double out = sqrt(p.x * p.x + p.y * p.y);
+  const Point radial = out > kTiny ? Point{p.x / out, p.y / out, 0.0} : Point{1.0, 0.0, 0.0};
+  const Field flat = box_field({out, 0.0, p.z}, {radius, HUGE_VAL, half});
+  const Point gradient = flat.gradient.x * radial;
+  return {flat.distance, {gradient.x, gradient.y, flat.gradient.z}};
+}
+
+/// Trilinear between the points of the grid.  Beyond them, the larger of two lower bounds: the surface lies
+/// behind the nearest point of the grid, and the distance grows at least as it does there if it is convex.
+inline Field grid_field(const Body& body, const Point& p) {
+  const double cell = body.sizes[0];
+  const double at[3] = {(p.x - body.corner.x) / cell, (p.y - body.corner.y) / cell,
+                        (p.z - body.corner.z) / cell};
+  int low[3];
+  double share[3], away[3];
+  for (int c = 0; c < 3; ++c) {
+    const double inside = min(max(at[c], 0.0), body.counts[c] - 1.0);
+    low[c] = static_cast<int>(min(inside, body.counts[c] - 2.0));
+    share[c] = inside - low[c], away[c] = cell * (at[c] - inside);
+  }
+  const int step_y = body.counts[2], step_x = body.counts[1] * step_y;
+  const float* first = &body.distances[low[0] * step_x + low[1] * step_y + low[2]];
+  double value = 0.0, slope[3] = {};
+  for (int k = 0; k < 8; ++k) {
+    const int x = k >> 2, y = k >> 1 & 1, z = k & 1;
+    const double d = first[x * step_x + y * step_y + z];
+    const double a = x ? share[0] : 1.0 - share[0], b = y ? share[1] : 1.0 - share[1],
+                 c = z ? share[2] : 1.0 - share[2];
+    value += a * b * c * d;
+    slope[0] += (x ? d : -d) * b * c, slope[1] += (y ? d : -d) * a * c, slope[2] += (z ? d : -d) * a * b;
+  }
+  const Field inside = of_length({slope[0], slope[1], slope[2]}, 0.0, {0.0, 0.0, 1.0});
+  const Point beyond = {away[0], away[1], away[2]};
+  const double further = dot(beyond, beyond);
+  if (further == 0.0) return {value, inside.gradient};
+  const double there = max(value, 0.0);
+  return {max(sqrt(further + there * there), there + dot(inside.gradient, beyond)), inside.gradient};
+}
+
+inline Field field_of(const Body& body, const Point& at) {
+  const Matrix& m = body.turn;
+  const Point q = at - body.position;
+  const Point p = {m[0] * q.x + m[3] * q.y + m[6] * q.z, m[1] * q.x + m[4] * q.y + m[7] * q.z,
+                   m[2] * q.x + m[5] * q.y + m[8] * q.z};
+  const auto& sizes = body.sizes;
+  Field field;
+  switch (body.shape) {
+    case Shape::kSphere: field = of_length(p, sizes[0], {0.0, 0.0, 1.0}); break;
+    case Shape::kBox: field = box_field(p, {sizes[0], sizes[1], sizes[2]}); break;
+    case Shape::kCylinder: field = cylinder_field(p, sizes[0], sizes[1]); break;
+    case Shape::kCapsule:
+      field = of_length({p.x, p.y, p.z - min(max(p.z, -sizes[0]), sizes[0])}, sizes[1], {1.0, 0.0, 0.0});
+      break;
+    default: field = grid_field(body, p);
+  }
+  return {field.distance, m * field.gradient};
+}
+
+/// A place between two points that is nearer to a body than both; without one, `share` is negative.
+struct Between {
+  double share;
+  Field field;
+};
+
+/// The distance from a convex body has at most one minimum along a segment: where its slope is 0, found by
+/// the method of false position (the Illinois variant).
+inline Between nearest_between(const Body& body, const Point& a, const Point& b, const Field& at_a,
+                               const Field& at_b) {
+  const Point along = b - a;
+  double low = 0.0, high = 1.0, down = dot(at_a.gradient, along), up = dot(at_b.gradient, along);
+  if (!(down < 0.0 && up > 0.0)) return {-1.0, {}};
+  const double flat = 1e-6 * sqrt(dot(along, along));
+  int side = 0;
+  Between best{};
+  for (int k = 0; k < 20; ++k) {
+    best.share = low - down * (high - low) / (up - down);
+    best.field = field_of(body, a + best.share * along);
+    const double slope = dot(best.field.gradient, along);
+    if (abs(slope) < flat || high - low < 1e-5) break;
+    if (slope > 0.0) {
+      high = best.share, up = slope;
+      if (side > 0) down /= 2;
+      side = 1;
+    } else {
+      low = best.share, down = slope;
+      if (side < 0) up /= 2;
+      side = -1;
+    }
+  }
+  return best;
+}
+
+/// Find the segments and bodies whose gap is below `reach` [m].
+inline void find_near(SceneContact& contact, const Point* points, int nodes, double reach) {
+  contact.near.clear();
+  const std::vector<Body>& scene = contact.scene->bodies;
+  Point low = points[0], high = points[0];
+  for (int i = 1; i < nodes; ++i) {
+    low = {min(low.x, points[i].x), min(low.y, points[i].y), min(low.z, points[i].z)};
+    high = {max(high.x, points[i].x), max(high.y, points[i].y), max(high.z, points[i].z)};
+  }
+  for (int k = 0; k < static_cast<int>(scene.size()); ++k) {
+    const Body& body = scene[k];
+    const double far = contact.radius + reach;
+    const auto outside = [&](double at, double from, double to) {
+      return max(max(from - at, at - to), 0.0);
+    };
+    const Point away = {outside(body.position.x, low.x, high.x), outside(body.position.y, low.y, high.y),
+                        outside(body.position.z, low.z, high.z)};
+    if (sqrt(dot(away, away)) > body.reach + far) continue;
+    for (int i = 0; i + 1 < nodes; ++i) {
+      const Point middle = 0.5 * (points[i] + points[i + 1]), half = points[i + 1] - middle;
+      const double within = sqrt(dot(half, half)) + far;
+      const Point apart = middle - body.position;
+      if (sqrt(dot(apart, apart)) > body.reach + within) continue;
+      if (field_of(body, middle).distance <= within) contact.near.push_back({k, i});
+    }
+  }
+}
+
+/// Call `act(body, node, share, field)` for each node of the near segments, and for each place between two
+/// nodes that is nearer to a body than both; share < 0: it is the node.
+template <class Act>
+inline void each_place(const SceneContact& contact, const Point* points, Act act) {
+  int body = -1, node = -1;
+  Field first{};
+  for (const auto& [k, i] : contact.near) {
+    const Body& at = contact.scene->bodies[k];
+    if (k != body || i != node) {
+      first = field_of(at, points[i]);
+      act(k, i, -1.0, first);
+    }
+    const Field second = field_of(at, points[i + 1]);
+    const Between between = nearest_between(at, points[i], points[i + 1], first, second);
+    if (between.share >= 0.0) act(k, i, between.share, between.field);
+    act(k, i + 1, -1.0, second);
+    body = k, node = i + 1, first = second;
+  }
+}
+
+inline std::size_t place_of(const SceneContact& contact, int body, int node, bool between) {
+  return 2 * (body * (contact.allowed.size() / (2 * contact.scene->bodies.size())) + node) + between;
+}
+
+/// Let what lies in a body at the start stay there.
+inline void begin(SceneContact& contact, const Point* points, int nodes) {
+  find_near(contact, points, nodes, 0.0);
+  each_place(contact, points, [&](int body, int node, double share, const Field& field) {
+    const double gap = field.distance - contact.radius;
+    if (!(gap < 0.0)) return;
+    if (contact.allowed.empty()) contact.allowed.assign(2 * contact.scene->bodies.size() * nodes, 0.0);
+    double& allowed = contact.allowed[place_of(contact, body, node, share >= 0.0)];
+    allowed = min(allowed, gap);
+  });
+  contact.near.clear();
+}
+
+/// Find the places that may touch a body in this step; those that did in the last one keep their state.
+inline void find_touches(SceneContact& contact, const Point* points, const double* inverse_masses, double step) {
+  contact.former.swap(contact.touches);
+  contact.touches.clear();
+  auto last = contact.former.begin();
+  each_place(contact, points, [&](int body, int node, double share, const Field& field) {
+    const bool between = share >= 0.0;
+    double gap = field.distance - contact.radius;
+    if (!contact.allowed.empty()) {
+      double& allowed = contact.allowed[place_of(contact, body, node, between)];
+      allowed = max(allowed, min(gap, 0.0));
+      gap -= allowed;
+    }
+    Touch touch{body, node, between, {1.0, 0.0}, field.gradient, 0.0, 0.0};
+    if (between) touch.weights = {1.0 - share, share};
+    touch.mobility = touch.weights[0] * touch.weights[0] * inverse_masses[node];
+    if (between) touch.mobility += touch.weights[1] * touch.weights[1] * inverse_masses[node + 1];
+    if (!(touch.mobility > 0.0)) return;  // a hand holds it
+    touch.least = gap > -kAllowed ? -(gap + kAllowed) / step : -kCorrected * (gap + kAllowed) / step;
+    const auto key = [&](const Touch& t) { return 2 * (t.body * 1LL * kMostNodes + t.node) + t.between; };
+    while (last != contact.former.end() && key(*last) < key(touch)) ++last;
+    if (last != contact.former.end() && key(*last) == key(touch))
+      touch.pushes = last->pushes && gap < kLeft, touch.drag = last->drag;
+    contact.touches.push_back(touch);
+  });
+}
+
+/// Write what the bodies that push a DLO add to the equations of its lane.
+template <class Number>
+inline void write_touches(Rods<Number>& rods, const SceneContact& contact, int lane) {
+  for (int i = 0; i < rods.nodes; ++i)
+    if (rods.any_touching[i]) {
+      auto& to = rods.touching[i];
+      for (int c = 0; c < 6; ++c) in_lane(to.own[c], lane) = in_lane(to.next[c], lane) = 0.0;
+      set_lane(to.impulse, lane, {0.0, 0.0, 0.0});
+    }
+  for (const Touch& touch : contact.touches) {
+    if (!touch.pushes) continue;
+    const double rigid = kRigid / touch.mobility, more = rigid - touch.drag;
+    const auto& [x, y, z] = touch.normal;
+    const std::array<double, 6> matrix = {more * x * x + touch.drag, more * x * y, more * x * z,
+                                          more * y * y + touch.drag, more * y * z, more * z * z + touch.drag};
+    const auto add = [&](int node, double own, double next, double weight) {
+      if (!rods.any_touching[node]) rods.touching[node] = {}, rods.any_touching[node] = true;
+      auto& to = rods.touching[node];
+      for (int c = 0; c < 6; ++c) {
+        in_lane(to.own[c], lane) += own * matrix[c];
+        in_lane(to.next[c], lane) += next * matrix[c];
+      }
+      set_lane(to.impulse, lane, in_lane(to.impulse, lane) + weight * rigid * touch.least * touch.normal);
+    };
+    const double a = touch.weights[0], b = touch.weights[1];
+    add(touch.node, a * a, a * b, a);
+    if (touch.between) add(touch.node + 1, b * b, 0.0, b);
+  }
+}
+
+/// The velocity at a place.
+template <class Number>
+inline Point velocity_at(const Touch& touch, std::vector<Vec3<Number>>& velocities, int lane) {
+  Point velocity = touch.weights[0] * in_lane(velocities[touch.node], lane);
+  if (touch.between) velocity = velocity + touch.weights[1] * in_lane(velocities[touch.node + 1], lane);
+  return velocity;
+}
+
+/// Take from a solution which bodies push and how the DLO slides; return whether that needs another solution.
+/// A body that pulls always does; `last`: nothing else does.
+template <class Number>
+inline bool learn(Rods<Number>& rods, SceneContact& contact, int lane, bool last) {
+  bool changed = false;
+  for (Touch& touch : contact.touches) {
+    const Point velocity = velocity_at(touch, rods.predicted, lane);
+    const double approach = dot(velocity, touch.normal);
+    const Point sliding = velocity - approach * touch.normal;
+    const double speed = sqrt(dot(sliding, sliding)), rigid = kRigid / touch.mobility;
+    const double coefficient = contact.friction * contact.scene->bodies[touch.body].friction;
+    if (!touch.pushes) {
+      if (last || !(approach < touch.least)) continue;
+      touch.pushes = changed = true;
+      touch.push = (touch.least - approach) / touch.mobility;
+      touch.drag = coefficient * touch.push / max(speed, kCreep);
+      continue;
+    }
+    touch.push = rigid * (touch.least - approach);
+    if (touch.push < 0.0) {
+      touch.pushes = false, changed = true;
+      continue;
+    }
+    touch.impulse = touch.push * touch.normal - touch.drag * sliding;
+    // If friction has held the DLO with more than it can, the speed is at most that of the mass alone.
+    const double limit = coefficient * touch.push, beyond = touch.drag * speed - limit;
+    const double other = limit / max(max(speed, beyond * touch.mobility), kCreep);
+    changed = changed || (!last && abs(other - touch.drag) * speed > kFrictionError * limit);
+    touch.drag = other;
+  }
+  return changed;
+}
+
+/// Solve the equations of a step with the bodies around each DLO.
+template <class Number>
+inline void solve_among_bodies(Rods<Number>& rods, const Ropes& ropes) {
+  std::fill(rods.any_touching.begin(), rods.any_touching.end(), false);
+  const double step = rods.step;
+  const auto furthest = [&](const std::vector<Vec3<Number>>& velocities) {
+    Number squares{};
+    for (const auto& velocity : velocities) squares = max(squares, dot(velocity, velocity));
+    return step * sqrt(squares);
+  };
+  Number moved = furthest(rods.velocities);
+  std::array<bool, kLanes> open{};
+  const auto find = [&](Rope& rope, int lane) {
+    if constexpr (lanes_of<Number> > 1)
+      for (int i = 0; i < rods.nodes; ++i) rope.rods.points[i] = in_lane(rods.points[i], lane);
+    find_touches(rope.surroundings, rope.rods.points.data(), rope.inverse_masses.data(), step);
+  };
+  for (std::size_t lane = 0; lane < ropes.size(); ++lane) {
+    SceneContact& contact = ropes[lane]->surroundings;
+    if (!contact.scene) continue;
+    open[lane] = true;
+    contact.room -= in_lane(moved, lane);
+    if (contact.near.empty()) continue;
+    find(*ropes[lane], lane);
+    write_touches(rods, contact, lane);
+  }
+  solve(rods);
+  Number coming = furthest(rods.predicted);
+  for (int k = 1; ; ++k) {
+    bool again = false;
+    for (std::size_t lane = 0; lane < ropes.size(); ++lane) {
+      Rope& rope = *ropes[lane];
+      SceneContact& contact = rope.surroundings;
+      if (!open[lane] || in_lane(rods.solved, lane) != 1.0) continue;
+      if (k == 1 && contact.room < in_lane(coming, lane)) {
+        const double skin = min(max(kThinSkin, kSkinSteps * in_lane(coming, lane)), kThickSkin);
+        contact.room = in_lane(coming, lane) + skin;
+        if constexpr (lanes_of<Number> > 1)
+          for (int i = 0; i < rods.nodes; ++i) rope.rods.points[i] = in_lane(rods.points[i], lane);
+        find_near(contact, rope.rods.points.data(), rods.nodes, contact.room);
+        find(rope, lane);
+      }
+      open[lane] = learn(rods, contact, lane, k >= kSolutions) && k < kMostSolutions;
+      if (open[lane]) write_touches(rods, contact, lane);
+      again = again || open[lane];
+    }
+    if (!again) return;
+    solve(rods);
+  }
+}
+
+/// Correct the predicted velocities where self-contact, or a solution that came too early, would push the DLO
+/// into a body.
+template <class Number>
+inline void keep_out(Rods<Number>& rods, Rope& rope, int lane) {
+  for (const Touch& touch : rope.surroundings.touches) {
+    const double approach = dot(velocity_at(touch, rods.predicted, lane), touch.normal);
+    if (!(approach < touch.least)) continue;
+    const Point impulse = ((touch.least - approach) / touch.mobility) * touch.normal;
+    for (int m = 0; m <= static_cast<int>(touch.between); ++m) {
+      auto& velocity = rods.predicted[touch.node + m];
+      const double by = touch.weights[m] * rope.inverse_masses[touch.node + m];
+      set_lane(velocity, lane, in_lane(velocity, lane) + by * impulse);
+    }
+  }
+}
+
+/// Add to `support` what the bodies have changed.
+template <class Number>
+inline void add_support(Rods<Number>& rods, Rope& rope, int lane) {
+  for (const Touch& touch : rope.surroundings.touches) {
+    if (!touch.pushes) continue;
+    for (int m = 0; m <= static_cast<int>(touch.between); ++m) {
+      auto& support = rods.support[touch.node + m];
+      const double by = touch.weights[m] * rope.inverse_masses[touch.node + m];
+      set_lane(support, lane, in_lane(support, lane) + by * touch.impulse);
+    }
+  }
+}
+
+}  // namespace DLO_TARGET
+}  // namespace dlo
