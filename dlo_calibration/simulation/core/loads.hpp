@@ -3,14 +3,11 @@
 // The loads that a DLO bears on its way: the sharpest bend, the largest tension and the largest strain.
 //
 // The curvature at a node is the change of the unit tangent per length that bends there.  The tension of a
-// segment is that of its spring, less what contact makes of it.  A step first solves the equations of the
-// rope, and then changes velocities by contact (`support`); the damping of the spring, c / dt EA / l along the
-// segment, opposes this difference in each step, so that the spring of a DLO that slides steadily is
-// stretched that much further than the force that it transmits (see rod.hpp for c).  A hand that holds a node
-// bears the tension of the segment and the weight of the half segment beside it.
+// segment is that of `find_tensions`; a hand that holds a node bears it, and the weight of the half segment
+// between them.  The strain is the tension of a segment divided by EA.
 //
 // Hands of a script change their speed within one step, which no hand can: the shock is up to
-// v sqrt(EA m / L).  So the strain is smoothed over `kSlow` until the hands have been steady that long, as if
+// v sqrt(EA m / L).  So tensions are smoothed over `kSlow` until the hands have been steady that long, as if
 // they took that time to change their speed, and later only as far as chatter of contact needs.  At the start,
 // the springs of a measured DLO are not in balance with its weight; they get time for that, too.
 
@@ -28,26 +25,20 @@ class LoadMeter {
   template <class Number>
   void measure(Rods<Number>& rods, int lane, const Rope& rope) {
     const Rods<double>& properties = rope.rods;
-    const double step = properties.step, damping = properties.implicit / step;
     const int segments = properties.nodes - 1;
-    strains_.resize(segments, 0.0), tangents_.resize(segments), lengths_.resize(segments);
-    hold(rope, step);
-    const double time = steady_ < kSlow ? kSlow : kFast, gain = step / (time + step);
+    tensions_.resize(segments, 0.0), tangents_.resize(segments), lengths_.resize(segments);
+    hold(rope, properties.step);
+    const double time = steady_ < kSlow ? kSlow : kFast, gain = properties.step / (time + properties.step);
     now_ = {};
     for (int i = 0; i < segments; ++i) {
       const Point segment = in_lane(rods.points[i + 1], lane) - in_lane(rods.points[i], lane);
-      const double length = sqrt(dot(segment, segment)), rest = properties.rest_lengths[i];
+      const double length = sqrt(dot(segment, segment));
       tangents_[i] = 1.0 / length * segment;
       lengths_[i] = is_rigid(i) ? 0.0 : length;
-      if (is_rigid(i)) {
-        strains_[i] = 0.0;  // the hand bears the forces
-        continue;
-      }
-      const Point slip = in_lane(rods.support[i + 1], lane) - in_lane(rods.support[i], lane);
-      const double strain = (length - damping * dot(slip, tangents_[i])) / rest - 1.0;
-      strains_[i] = strains_[i] + gain * (strain - strains_[i]);
-      raise(now_.strain, strains_[i], i + 0.5);
-      raise(now_.tension, tension(properties, i), i + 0.5);
+      // Where a hand holds both ends, it bears the forces.
+      tensions_[i] = is_rigid(i) ? 0.0 : tensions_[i] + gain * (in_lane(rods.tensions[i], lane) - tensions_[i]);
+      raise(now_.strain, tensions_[i] / (properties.stiffness[i] * properties.rest_lengths[i]), i + 0.5);
+      raise(now_.tension, tensions_[i], i + 0.5);
     }
     for (int i = 0; i + 1 < segments; ++i) {
       const Point bend = tangents_[i + 1] - tangents_[i];
@@ -77,18 +68,14 @@ class LoadMeter {
 
   bool is_rigid(int segment) const { return is_held_[segment] && is_held_[segment + 1]; }
 
-  double tension(const Rods<double>& properties, int segment) const {
-    return properties.stiffness[segment] * properties.rest_lengths[segment] * strains_[segment];
-  }
-
   /// Add the tension at a held node, beside a segment that leaves it in the direction `sign`.
   void bear(const Rods<double>& properties, int node, int segment, double sign) {
     const auto& rests = properties.rest_lengths;
     const int other = sign > 0.0 ? segment - 1 : segment + 1;
     const bool end = other < 0 || other >= static_cast<int>(rests.size());
     const double share = end ? 1.0 : rests[segment] / (rests[segment] + rests[other]);
-    const double weight = sign * share * properties.masses[node] * dot(properties.gravity, tangents_[segment]);
-    raise(now_.tension, tension(properties, segment) + weight, node);
+    const double weight = share * properties.masses[node] * dot(properties.gravity, tangents_[segment]);
+    raise(now_.tension, tensions_[segment] + sign * weight, node);
   }
 
   /// Take what holds the rope in this step, and for how long that has been steady.
@@ -105,7 +92,7 @@ class LoadMeter {
     for (int node : held_) is_held_[node] = true;
   }
 
-  std::vector<double> strains_, lengths_;  // of the segments; smoothed; [m] that bends
+  std::vector<double> tensions_, lengths_;  // of the segments: smoothed [N]; that bend [m]
   std::vector<Point> tangents_;
   std::vector<int> held_;
   std::vector<char> is_held_;

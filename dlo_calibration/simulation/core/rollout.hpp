@@ -26,7 +26,10 @@ void copy_out(std::vector<Vec3<Number>>& rows, int lane, std::vector<Point>& to)
 class Rollout {
  public:
   Rollout(const Script& script, Rope& rope, Outcome& outcome)
-      : rope(rope), outcome(outcome), script_(script), offsets_(script.rows), before_(rope.rods.points) {}
+      : rope(rope), outcome(outcome), script_(script), offsets_(script.rows), before_(rope.rods.points) {
+    rope.rods.measured = script.loads;
+    rope.rods.resize();
+  }
 
   /// Go on to the next move; return whether there is one.
   bool next() {
@@ -231,6 +234,7 @@ class LaneGroup {
       rods_ = Rods<Lanes>();
       rods_.nodes = first.nodes, rods_.step = first.step, rods_.gravity = first.gravity;
       rods_.framed = first.framed, rods_.twists = first.twists, rods_.strands_rub = first.strands_rub;
+      rods_.measured = first.measured;
       rods_.resize();
     }
     for (Rollout* rollout : rollouts)
