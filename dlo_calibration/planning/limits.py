@@ -1,9 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Limits: where hands and DLO may be, how sharply the DLO may bend, how hard be pulled, and how often cross itself.
-"""
+"""Limits: where hands and DLO may be, what the DLO may bear, and how often it may cross itself."""
 
 from __future__ import annotations
 
@@ -209,14 +207,14 @@ class Limits:
         """
         Return which limit loads pass; empty if they pass none, or are unknown.
 
-        :returns: a phrase such as 'the DLO bends more sharply than to 30 mm (least_bend_radius)'.
+        :returns: a phrase such as 'the DLO is pulled harder than most_tension, 2 N'.
         """
         if loads is None:
             return ''
         if self.least_bend_radius > 0 and loads.most[:, CURVATURE].max() > 1 / self.least_bend_radius:
-            return f'the DLO bends more sharply than to {1e3 * self.least_bend_radius:g} mm (least_bend_radius)'
+            return f'the DLO is bent more sharply than least_bend_radius, {1e3 * self.least_bend_radius:g} mm'
         if self.most_tension > 0 and loads.most[:, TENSION].max() > self.most_tension:
-            return f'the tension in the DLO is above {self.most_tension:g} N (most_tension)'
+            return f'the DLO is pulled harder than most_tension, {self.most_tension:g} N'
         return ''
 
     def box(self, chains: Floats) -> str:

@@ -85,5 +85,6 @@ def plain_loads(loads: ActionLoads | None) -> dict[str, Any]:
         known = None if loads is None else (
             (loads.least_bend_radius, loads.most_tension, loads.most_strain)[k], float(loads.places[k]),
             list(loads.ends[k]))
-        values[f'{key}{unit}'], values[f'{key}_at_m'], values[f'{key}_lower_upper{unit}'] = known or (None,) * 3
+        names = (f'{key}{unit}', f'{key}_at_m', f'{key}_lower_upper{unit}')
+        values.update(zip(names, known or (None,) * 3, strict=True))
     return values

@@ -48,10 +48,10 @@ class PlanOptions(DeclaredOptions):
         'in metres in the frame of the table; they should be larger than what they protect by the size of '
         'the gripper, as a hand counts as a point', of=MACHINE)
     least_bend_radius: float = declared(
-        0.0, 'smallest radius to which an action may bend the DLO, e.g. of the data sheet of a cable; at most '
+        0.0, 'smallest radius to which actions may bend the DLO, e.g. that of a data sheet; at most '
         'one draw in ten may be bent more sharply; 0: any', unit='m', minimum=0.0, maximum=10.0, of=MACHINE)
     most_tension: float = declared(
-        0.0, 'largest tension that an action may cause in the DLO, likewise; 0: any', unit='N', minimum=0.0,
+        0.0, 'largest tension that actions may cause in the DLO, likewise; 0: any', unit='N', minimum=0.0,
         maximum=1e6, of=MACHINE)
     workers: int = declared(0, 'number of threads that simulate; 0: one per core', minimum=0, maximum=1024,
                             of=MACHINE)

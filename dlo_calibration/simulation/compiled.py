@@ -121,7 +121,7 @@ class Engine:
         if outcome is None:
             raise SimulationError('the rollout diverged: the chain is no longer finite')
         nodes, settled, steps, measured = outcome
-        loads = Loads.measured(measured, prepared.layout.places) if len(measured) else None
+        loads = Loads.measured(measured, prepared.layout.places) if measured is not None else None
         return Rollout(prepared.layout.observe @ nodes, settled, steps * self._time_step, steps, loads)
 
     def refined(self) -> Self:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 #: kinds of processors whose code this processor can execute, the fastest first; all give the same bits
 TARGETS: tuple[str, ...]
 
-Outcome = tuple[NDArray[np.float64], tuple[bool, ...], int, NDArray[np.float64]]  # see `roll_out`
+Outcome = tuple[NDArray[np.float64], tuple[bool, ...], int, NDArray[np.float64] | None]  # see `roll_out`
 
 class Start:
     """
@@ -112,7 +112,7 @@ def roll_out(jobs: Sequence[tuple[Script, Start, Mapping[str, float], float]], t
         is a stable configuration (else True), the number of steps, and the loads; None if the rollout
         diverged.  The loads (g, 3, 2) are the sharpest curvature [1/m], the largest tension [N] and the
         largest strain since the goal before, each with its place: the index of a node, or the middle between
-        two; (0, 3, 2) if the script does not ask for them.  After a stop, outcomes are meaningless.
+        two; None if the script does not ask for them.  After a stop, outcomes are meaningless.
     """
 
 class Rope:

@@ -229,17 +229,19 @@ void require_fit(const Script& script, std::size_t nodes) {
           " nodes; expected at most the ", nodes, " of the DLO; write the script for this DLO");
 }
 
-/// Nodes at the goals (g, N, 3), settled (g,), steps, and loads (g, 3, 2), or (0, 3, 2) if they were not asked
-/// for; None: the rollout diverged.
+/// Nodes at the goals (g, N, 3), settled (g,), steps, and loads (g, 3, 2), or None if they were not measured;
+/// None: the rollout diverged.
 py::object answer(const Outcome& outcome) {
   const std::size_t nodes = outcome.seen.empty() ? 0 : outcome.seen[0].size();
   Array seen({outcome.seen.size(), nodes, std::size_t{3}});
   for (std::size_t k = 0; k < outcome.seen.size(); ++k)
     std::copy_n(&outcome.seen[k][0].x, 3 * nodes, seen.mutable_data(k, 0, 0));
   if (outcome.diverged || !all_finite(seen)) return py::none();
-  Array loads({outcome.loads.size(), std::size_t{3}, std::size_t{2}});
-  static_assert(sizeof(Loads) == 6 * sizeof(double));
-  std::copy_n(reinterpret_cast<const double*>(outcome.loads.data()), loads.size(), loads.mutable_data());
+  py::object loads = py::none();
+  if (!outcome.loads.empty()) {
+    static_assert(sizeof(Loads) == 6 * sizeof(double));
+    loads = Array({outcome.loads.size(), std::size_t{3}, std::size_t{2}}, &outcome.loads[0].curvature.value);
+  }
   return py::make_tuple(seen, py::tuple(py::cast(outcome.settled)), outcome.steps, loads);
 }
 
