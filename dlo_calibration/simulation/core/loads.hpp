@@ -15,7 +15,7 @@ namespace dlo {
 namespace DLO_TARGET {
 
 constexpr double kSlow = 0.05, kFast = 0.01;  // s
-constexpr double kBalance = 0.2;              // s; until then a measured start is hardly in balance
+constexpr double kBalance = 0.5;              // s; until then a measured start is hardly in balance
 constexpr double kJerk = 2.0;                 // m/s^2; a hand that is faster accelerated is not steady
 
 /// Measures the loads of one DLO after each step.
