@@ -239,7 +239,7 @@ class BeamSearch:
         """Why the search ended after it had tried the largest number of actions."""
         most, used = self._options.actions, 0 if self.judged is None else len(self.judged.steps)
         return f'the largest number of actions, {most}, is used up' if used == most else \
-            f'further actions, up to {most} in all, save less than {1 - PRICE:.0%} of the error each'
+            f'further actions, up to {most} in all, save less than {PRICE - 1:.0%} of the error each'
 
     def _rank(self, cost: float, actions: int) -> tuple[bool, float]:
         """Return a key that is lower for a better sequence: it reaches the goal, or is worth its actions."""
