@@ -36,6 +36,7 @@ PRICE = 1.08  # factor on the cost that an action must save
 NEAR = 2.0  # times the tolerance; below that cost, all displacements are refined together
 TOGETHER = 3  # Gauss-Newton steps for all displacements of a sequence
 PATIENCE = 1  # consecutive actions that need not gain anything
+SELDOM = 0.1  # share of the draws in which the DLO may bear more than permitted
 
 Result = TypeVar('Result')
 Asking = Generator[list[RehearsalJob], Sequence[Rehearsal], Result]
@@ -238,7 +239,7 @@ class BeamSearch:
         """Why the search ended after it had tried the largest number of actions."""
         most, used = self._options.actions, 0 if self.judged is None else len(self.judged.steps)
         return f'the largest number of actions, {most}, is used up' if used == most else \
-            f'further actions, up to {most} in all, save less than {1 - PRICE:.0%} of the error each'
+            f'further actions, up to {most} in all, save less than {PRICE - 1:.0%} of the error each'
 
     def _rank(self, cost: float, actions: int) -> tuple[bool, float]:
         """Return a key that is lower for a better sequence: it reaches the goal, or is worth its actions."""
@@ -334,7 +335,8 @@ class BeamSearch:
         """Return the sequences that drafts become; None if one is not permitted or cannot be simulated."""
         permitted = [draft for draft in drafts if self._permits(draft)]
         jobs = [RehearsalJob(draft.base.chain if draft.base.moves else self._start,
-                             self._steps(draft.moves, draft.before), self._physical, self._watched)
+                             self._steps(draft.moves, draft.before), self._physical, self._watched,
+                             self._limits.of_loads)
                 for draft in permitted]
         rehearsals = (yield jobs) if jobs else []
         outcomes = {id(draft): self._sequence(draft, rehearsal)
@@ -357,7 +359,8 @@ class BeamSearch:
 
     def _sequence(self, draft: Draft, rehearsal: Rehearsal) -> MoveSequence | None:
         """Return the sequence that a draft becomes; None if it failed or is not permitted."""
-        if rehearsal.failure or not self._allowed(self._refusal(rehearsal)):
+        if rehearsal.failure or not self._allowed(
+                self._refusal(rehearsal) or self._limits.overload(rehearsal.loads)):
             return None
         sequence = MoveSequence(
             (*draft.base.moves, *draft.moves), np.concatenate([draft.base.chains, rehearsal.chains]),
@@ -377,7 +380,7 @@ class BeamSearch:
         """Simulate whole sequences with the best parameters and with the draws."""
         parameters = [self._physical, *self._draws]
         planned = [self._steps(sequence.moves, sequence.chains[:-1]) for sequence in sequences]
-        jobs = [RehearsalJob(self._start, steps, physical, self._watched)
+        jobs = [RehearsalJob(self._start, steps, physical, self._watched, loads=True)
                 for steps in planned for physical in parameters]
         rehearsals = iter((yield jobs) if jobs else [])
         self._judged.update(sequences)
@@ -386,9 +389,16 @@ class BeamSearch:
             drawn = [draw for draw in drawn if not draw.failure]
             if best.failure or not all(self._allowed(self._refusal(draw)) for draw in (best, *drawn)):
                 continue
+            if not self._allowed(self._limits.overload(best.loads) or self._often_overloaded(drawn)):
+                continue
             cost = float(np.mean([self._objective.cost(draw.chains[-1]) for draw in drawn or [best]]))
             if self._rank(cost, len(steps)) < self._judged_rank:
                 self.judged = JudgedSequence(sequence, steps, best, tuple(drawn), cost)
+
+    def _often_overloaded(self, drawn: Sequence[Rehearsal]) -> str:
+        """Return which limit the loads pass in too many draws; empty if there is none."""
+        overloads = list(filter(None, (self._limits.overload(draw.loads) for draw in drawn)))
+        return overloads[0] if len(overloads) > SELDOM * len(drawn) else ''
 
 
 def refine(shifts: Floats, residuals: Floats, iterations: int

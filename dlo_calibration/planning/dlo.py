@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Mapping, Protocol
+from typing import Mapping, Protocol, Sequence
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from dlo_calibration.model.score import PointErrors
 from dlo_calibration.observation.table import lying_level
 
 Z90 = 1.6449  # standard deviations from the middle of a normal distribution to an end of its 90 % interval
+INTERVAL = (5.0, 95.0)  # %
 
 
 class CalibratedDlo(Protocol):
@@ -111,3 +112,23 @@ class Posterior:
     def _physical(self, values: Floats) -> dict[str, float]:
         named = dict(zip(self.space.free, map(float, values), strict=True))
         return self.space.physical(named, self.length)
+
+
+def intervals(best: Floats, drawn: Sequence[Floats], error: float,
+              finer: Floats | None = None) -> tuple[Floats, Floats]:
+    """
+    Return the lower and upper ends of the 90 % intervals of predicted values, both like `best`.
+
+    They contain the spread of the draws, the residual error of the calibration (noise and model error), and
+    the difference to a finer simulation.  These are independent, so their half widths add as squares.
+
+    :param best: (..., 3) with the best parameters.
+    :param drawn: the same with draws from the posterior.
+    :param error: residual error of the calibration: standard deviation of one value.
+    :param finer: like `best`, from a finer simulation; None: there is none.
+    """
+    everything = np.stack([best, *drawn])
+    below, above = best - np.percentile(everything, INTERVAL, axis=0)
+    residual = (Z90 * error)**2 + (0.0 if finer is None else (finer - best)**2)
+    return (best - np.sqrt(np.maximum(below, 0)**2 + residual),
+            best + np.sqrt(np.minimum(above, 0)**2 + residual))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Limits: where hands and DLO may be: regions of space, and how often the DLO may cross itself."""
+"""Limits: where hands and DLO may be, what the DLO may bear, and how often it may cross itself."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from dlo_calibration.errors import InputError
 from dlo_calibration.model.action import Action
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.observation.table import crossing_segments
+from dlo_calibration.simulation.loads import CURVATURE, Loads, TENSION
 
 HANDS = ('hand_1', 'hand_2')
 MOST = 1e6  # m; limit of coordinates, far beyond those of any robot
@@ -143,20 +144,25 @@ def _numbers(thing: str, text: str, words: Sequence[str], count: int, expected: 
 @dataclass(frozen=True)
 class Limits:
     """
-    Where the hands of a plan can be, and where neither they nor the DLO may be.
+    Where the hands of a plan can be, where neither they nor the DLO may be, and what the DLO may bear.
 
     A hand counts as a point.
 
     :param reach: for each name in HANDS, where this hand can be; `reach_texts` the options that say so.
     :param no_go: boxes, by the texts that describe them.
+    :param least_bend_radius: of the DLO [m]; 0: any.
+    :param most_tension: in the DLO [N]; 0: any.
     """
 
     reach: Mapping[str, Region]
     reach_texts: Mapping[str, str]
     no_go: Mapping[str, Box]
+    least_bend_radius: float = 0.0
+    most_tension: float = 0.0
 
     @classmethod
-    def read(cls, reach_1: str, reach_2: str, no_go: Sequence[str]) -> Self:
+    def read(cls, reach_1: str, reach_2: str, no_go: Sequence[str], least_bend_radius: float = 0.0,
+             most_tension: float = 0.0) -> Self:
         """
         Return the limits that options of a plan describe.
 
@@ -164,7 +170,8 @@ class Limits:
         """
         texts = {'hand_1': reach_1, 'hand_2': reach_2}
         reach = {name: read_reach(f'parameter reach_{k}', texts[name]) for k, name in enumerate(HANDS, 1)}
-        return cls(reach, texts, {text: read_box('parameter no_go', text) for text in no_go})
+        return cls(reach, texts, {text: read_box('parameter no_go', text) for text in no_go},
+                   least_bend_radius, most_tension)
 
     def refusal(self, action: Action) -> str:
         """
@@ -190,6 +197,25 @@ class Limits:
         """
         box = self.box(chains)
         return box and f'the DLO enters the no-go box {box}'
+
+    @property
+    def of_loads(self) -> bool:
+        """Whether they limit what the DLO bears."""
+        return self.least_bend_radius > 0 or self.most_tension > 0
+
+    def overload(self, loads: Loads | None) -> str:
+        """
+        Return which limit loads pass; empty if they pass none, or are unknown.
+
+        :returns: a phrase such as 'the DLO is pulled harder than most_tension, 2 N'.
+        """
+        if loads is None:
+            return ''
+        if self.least_bend_radius > 0 and loads.most[:, CURVATURE].max() > 1 / self.least_bend_radius:
+            return f'the DLO is bent more sharply than least_bend_radius, {1e3 * self.least_bend_radius:g} mm'
+        if self.most_tension > 0 and loads.most[:, TENSION].max() > self.most_tension:
+            return f'the DLO is pulled harder than most_tension, {self.most_tension:g} N'
+        return ''
 
     def box(self, chains: Floats) -> str:
         """Return the text of the first box that one of m chains, (m, n, 3) [m], enters; '' if none does."""

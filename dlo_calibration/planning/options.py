@@ -47,6 +47,12 @@ class PlanOptions(DeclaredOptions):
         (), "boxes that neither a hand nor the DLO may enter, each 'x0 y0 z0 x1 y1 z1', two opposite corners "
         'in metres in the frame of the table; they should be larger than what they protect by the size of '
         'the gripper, as a hand counts as a point', of=MACHINE)
+    least_bend_radius: float = declared(
+        0.0, 'smallest radius to which actions may bend the DLO, e.g. that of a data sheet; at most '
+        'one draw in ten may be bent more sharply; 0: any', unit='m', minimum=0.0, maximum=10.0, of=MACHINE)
+    most_tension: float = declared(
+        0.0, 'largest tension that actions may cause in the DLO, likewise; 0: any', unit='N', minimum=0.0,
+        maximum=1e6, of=MACHINE)
     workers: int = declared(0, 'number of threads that simulate; 0: one per core', minimum=0, maximum=1024,
                             of=MACHINE)
 
@@ -60,8 +66,8 @@ class PlanOptions(DeclaredOptions):
     @property
     def limits(self) -> Limits:
         """
-        Where hands and DLO may be.
+        Where hands and DLO may be, and what the DLO may bear.
 
         :raises InputError: if one of the options cannot be read.
         """
-        return Limits.read(self.reach_1, self.reach_2, self.no_go)
+        return Limits.read(self.reach_1, self.reach_2, self.no_go, self.least_bend_radius, self.most_tension)

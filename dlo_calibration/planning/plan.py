@@ -14,6 +14,7 @@ from dlo_calibration.calibration.result import with_nulls
 from dlo_calibration.model.action import Action, Hand, NO_ROTATION
 from dlo_calibration.model.chain import Chain, Floats, grip_place
 from dlo_calibration.model.pose import Pose
+from dlo_calibration.planning.loads import ActionLoads, plain_loads
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,7 @@ class PlannedAction:
     :param action: the paths of the hands; they close at time 0 and open where they arrive.
     :param predicted: (n, 3) [m] with the best parameters.
     :param lower: (n, 3) [m] lower ends of the 90 % intervals of each coordinate; `upper` (n, 3) upper ends.
+    :param loads: the largest ones of the DLO; None if the engine does not know them.
     """
 
     name: str
@@ -32,6 +34,7 @@ class PlannedAction:
     predicted: Floats
     lower: Floats
     upper: Floats
+    loads: ActionLoads | None = None
 
     def moved(self, pose: Pose) -> PlannedAction:
         """
@@ -91,11 +94,11 @@ def plain_plan(plan: Plan) -> dict[str, Any]:
     """
     Return a plan as plain values, under the keys that `plan --json` prints and `~/steps` carries.
 
-    Lengths are in m, times in s, the score in cm.
+    Lengths are in m, times in s, tensions in N, the score in cm.
     """
     return dict(with_nulls({
         'actions': [plain_action(plan.start, planned.name, planned.action, planned.predicted, planned.lower,
-                                 planned.upper) for planned in plan.actions],
+                                 planned.upper, planned.loads) for planned in plan.actions],
         'error_before_m': plan.error_before, 'error_after_m': plan.error_after,
         'error_after_percent_of_length': 100 * plan.error_after / plan.start.length,
         'score_after': plan.score_after, 'reached': plan.reached, 'tolerance_m': plan.tolerance,
@@ -103,16 +106,17 @@ def plain_plan(plan: Plan) -> dict[str, Any]:
         'stop_reason': plan.stop_reason, 'remarks': plan.warnings}))
 
 
-def plain_action(start: Chain, name: str, action: Action, predicted: Floats, lower: Floats, upper: Floats
-                 ) -> dict[str, Any]:
+def plain_action(start: Chain, name: str, action: Action, predicted: Floats, lower: Floats, upper: Floats,
+                 loads: ActionLoads | None) -> dict[str, Any]:
     """
-    Return an action and the DLO at rest after it as plain values.
+    Return an action, the DLO at rest after it, and its loads, as plain values.
 
     :param start: a chain with the same points as the DLO.
     :param predicted: (n, 3) [m]; `lower` (n, 3) and `upper` (n, 3) are ends of the 90 % intervals.
     """
     return {'name': name, 'hands': [_plain_hand(start, action, hand) for hand in action.hands],
-            'predicted': predicted.tolist(), 'predicted_lower_upper_m': [lower.tolist(), upper.tolist()]}
+            'predicted': predicted.tolist(), 'predicted_lower_upper_m': [lower.tolist(), upper.tolist()],
+            **plain_loads(loads)}
 
 
 def _plain_hand(start: Chain, action: Action, hand: Hand) -> dict[str, Any]:

@@ -23,11 +23,11 @@ from dlo_calibration.model.chain import Chain, frozen_array
 from dlo_calibration.model.parameters import GRAVITY, natural_curvature
 from dlo_calibration.observation.table import HANGING, lying_level
 from dlo_calibration.planning.beam import BeamSearch, JudgedSequence, Objective
-from dlo_calibration.planning.dlo import CalibratedDlo, Posterior
+from dlo_calibration.planning.dlo import CalibratedDlo, intervals, Posterior
 from dlo_calibration.planning.limits import crossings, HANDS
+from dlo_calibration.planning.loads import loads_of_actions
 from dlo_calibration.planning.options import PlanOptions
 from dlo_calibration.planning.plan import Plan, PlannedAction
-from dlo_calibration.planning.prediction import intervals
 from dlo_calibration.planning.rehearsal import ActionStep, RehearsalJob, Rehearser
 
 START, GOAL = 'start chain', 'goal chain'  # in errors
@@ -74,12 +74,13 @@ def goal_warnings(rehearse: Rehearser, posterior: Posterior, start: Chain, goal:
     """
     Return why a goal cannot be reached exactly, and how near the DLO gets.
 
-    :param rehearse: simulates at most 1 + DRAWS actions.
+    :param rehearse: simulates at most 3 + DRAWS actions.
     :param start: and `goal`: from `checked`.
     :raises CancelledError: as `rehearse` does.
     """
     return (*_warnings_of_length(start, goal, options.tolerance / 100),
             *_warnings_of_limits(start, goal, options),
+            *_warnings_of_loads(rehearse, posterior, start, goal, options),
             *_warnings_of_rest(rehearse, posterior, goal, options))
 
 
@@ -147,11 +148,29 @@ def _warnings_of_limits(start: Chain, goal: Chain, options: PlanOptions) -> Iter
         yield f'the DLO is in the no-go box {box} at the start'
 
 
+def _warnings_of_loads(rehearse: Rehearser, posterior: Posterior, start: Chain, goal: Chain,
+                       options: PlanOptions) -> Iterator[str]:
+    """Touch the DLO where it lies and on the goal, and warn if it bears more there than permitted."""
+    if not options.limits.of_loads:
+        return
+    at_start, at_goal = rehearse([RehearsalJob(chain, (_touch(chain),), posterior.best, loads=True)
+                                  for chain in (start, goal)])
+    if overload := options.limits.overload(at_start.loads):
+        yield f'at the start already, {overload}, so no action is permitted'
+    if overload := options.limits.overload(at_goal.loads):
+        yield f'exactly on the goal, {overload}'
+
+
+def _touch(chain: Chain) -> ActionStep:
+    """Return an action in which a hand closes at the middle of a chain, and opens again."""
+    middle = len(chain) // 2
+    return ActionStep(Action((Hand(HANDS[0], (middle,), np.zeros(1), chain.points[[middle]]),)))
+
+
 def _warnings_of_rest(rehearse: Rehearser, posterior: Posterior, goal: Chain,
                      options: PlanOptions) -> Iterator[str]:
     """Lay the DLO exactly on the goal, let it go, and warn if it moves far."""
-    middle = len(goal) // 2
-    touch = ActionStep(Action((Hand(HANDS[0], (middle,), np.zeros(1), goal.points[[middle]]),)))
+    touch = _touch(goal)
     drawn = posterior.draws(min(DRAWS, options.draws), options.seed)
     rehearsals = rehearse([RehearsalJob(goal, (touch,), physical) for physical in (posterior.best, *drawn)])
     failures = [rehearsal.failure for rehearsal in rehearsals if rehearsal.failure]
@@ -276,9 +295,10 @@ def planned_actions(judged: JudgedSequence, error: float) -> tuple[PlannedAction
     :param error: root mean square point distance that the calibration left [m].
     """
     lower, upper = intervals(judged.best.chains, [drawn.chains for drawn in judged.drawn], error / np.sqrt(3))
+    loads = loads_of_actions(judged.best, judged.drawn)
     return tuple(
         PlannedAction(move.name, step.starting(0.0).action, frozen_array(judged.best.chains[k]),
-                      frozen_array(lower[k]), frozen_array(upper[k]))
+                      frozen_array(lower[k]), frozen_array(upper[k]), loads[k])
         for k, (move, step) in enumerate(zip(judged.sequence.moves, judged.steps, strict=True)))
 
 

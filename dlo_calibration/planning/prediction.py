@@ -22,12 +22,12 @@ from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain, Floats, frozen_array
 from dlo_calibration.model.named_actions import NamedAction, SimultaneousActions
 from dlo_calibration.observation.noise import NO_NOISE, noise_of
-from dlo_calibration.planning.dlo import CalibratedDlo, Posterior, Z90
+from dlo_calibration.planning.dlo import CalibratedDlo, intervals, Posterior
+from dlo_calibration.planning.loads import ActionLoads, loads_of_actions
 from dlo_calibration.planning.plan import plain_action
 from dlo_calibration.planning.rehearsal import ActionStep, in_turn, PAUSE, Rehearsal, RehearsalJob, rehearse
 
 DRAWS = 20  # from the posterior, which is enough for the ends of a 90 % interval
-INTERVAL = (5.0, 95.0)  # %
 Doing = Union[NamedAction, Action, ActionStep, SimultaneousActions]
 
 
@@ -41,6 +41,7 @@ class PredictedStep:
     :param chain: (n, 3) [m] with the best parameters.
     :param lower: (n, 3) [m] lower ends of the 90 % intervals of each coordinate; `upper` (n, 3) upper ends.
     :param settled: False if the DLO did not come to rest within the time limit.
+    :param loads: the largest ones in the action; None if the engine does not know them.
     """
 
     name: str
@@ -49,6 +50,7 @@ class PredictedStep:
     lower: Floats
     upper: Floats
     settled: bool
+    loads: ActionLoads | None = None
 
 
 @dataclass(frozen=True)
@@ -99,39 +101,20 @@ def simulate(dlo: CalibratedDlo, chain: Chain,
     with closing(make_simulator(options)) as simulator, closing(Threads(options.workers)) as threads:
         pool = Pool(simulator, threads, should_stop)
         steps, best = _steps(pool, chain, actions, posterior.best)
-        drawn = rehearse(pool, [RehearsalJob(start, steps, physical) for start, physical in zip(
+        drawn = rehearse(pool, [RehearsalJob(start, steps, physical, loads=True) for start, physical in zip(
             _starts(chain, draws, seed), posterior.draws(draws, seed), strict=True)])
-        finer = _finer(pool, RehearsalJob(chain, steps, posterior.best))
+        finer = _finer(pool, RehearsalJob(chain, steps, posterior.best, loads=True))
     failures = [rehearsal.failure for rehearsal in drawn if rehearsal.failure]
     warnings = () if not failures else (
         f'{len(failures)} of {draws} draws from the posterior could not be simulated: {failures[0]}',)
     lower, upper = intervals(best.chains, [draw.chains for draw in drawn if not draw.failure],
-                             dlo.errors.rms / np.sqrt(3), finer)
+                             dlo.errors.rms / np.sqrt(3), None if finer is None else finer.chains)
+    loads = loads_of_actions(best, drawn, finer)
     return Prediction(
         chain, tuple(PredictedStep(action.name, step, frozen_array(best.chains[k]), frozen_array(lower[k]),
-                                   frozen_array(upper[k]), best.settled[k])
+                                   frozen_array(upper[k]), best.settled[k], loads[k])
                      for k, (action, step) in enumerate(zip(actions, steps, strict=True))),
         draws, posterior.best, warnings)
-
-
-def intervals(best: Floats, drawn: Sequence[Floats], error: float,
-              finer: Floats | None = None) -> tuple[Floats, Floats]:
-    """
-    Return the lower and upper ends of the 90 % intervals of predicted coordinates, both like `best`.
-
-    They contain the spread of the draws, the residual error of the calibration (noise and model error), and
-    the difference to a finer simulation.  These are independent, so their half widths add as squares.
-
-    :param best: (..., 3) [m] with the best parameters.
-    :param drawn: the same with draws from the posterior.
-    :param error: residual error of the calibration: standard deviation of one coordinate [m].
-    :param finer: like `best`, from a finer simulation; None: there is none.
-    """
-    everything = np.stack([best, *drawn])
-    below, above = best - np.percentile(everything, INTERVAL, axis=0)
-    residual = (Z90 * error)**2 + (0.0 if finer is None else (finer - best)**2)
-    return (best - np.sqrt(np.maximum(below, 0)**2 + residual),
-            best + np.sqrt(np.minimum(above, 0)**2 + residual))
 
 
 def _starts(chain: Chain, draws: int, seed: int) -> list[Chain]:
@@ -144,14 +127,14 @@ def _starts(chain: Chain, draws: int, seed: int) -> list[Chain]:
             for _ in range(draws)]
 
 
-def _finer(pool: Pool, job: RehearsalJob) -> Floats | None:
-    """Return the chains after each action by a finer simulation; None if there is none."""
+def _finer(pool: Pool, job: RehearsalJob) -> Rehearsal | None:
+    """Return the rehearsal of a job by a finer simulation; None if there is none."""
     refined = pool.refined()
     if refined is None:
         return None
     with closing(refined.simulator):
         rehearsal, = rehearse(refined, [job])
-    return None if rehearsal.failure else rehearsal.chains
+    return None if rehearsal.failure else rehearsal
 
 
 def _steps(pool: Pool, chain: Chain, actions: Sequence[Doing],
@@ -193,7 +176,7 @@ def _combined(together: SimultaneousActions, before: Chain, earlier: Sequence[Ac
 
 def _rehearsed(pool: Pool, chain: Chain, steps: Sequence[ActionStep], physical: dict[str, float]
                ) -> Rehearsal:
-    rehearsal, = rehearse(pool, [RehearsalJob(chain, tuple(steps), physical)])
+    rehearsal, = rehearse(pool, [RehearsalJob(chain, tuple(steps), physical, loads=True)])
     if rehearsal.failure:
         raise SimulationError(rehearsal.failure)
     return rehearsal
@@ -203,10 +186,10 @@ def plain_prediction(prediction: Prediction) -> dict[str, Any]:
     """
     Return a prediction as plain values, under the keys that `simulate --json` prints.
 
-    Lengths are in m, times in s.
+    Lengths are in m, times in s, tensions in N.
     """
     return dict(with_nulls({
         'actions': [{**plain_action(prediction.start, step.name, step.step.action, step.chain, step.lower,
-                                    step.upper),
+                                    step.upper, step.loads),
                      'held_by': step.step.held_by, 'settled': step.settled} for step in prediction.steps],
         'draws': prediction.draws, 'remarks': prediction.warnings}))

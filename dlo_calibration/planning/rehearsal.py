@@ -16,6 +16,7 @@ from dlo_calibration.evaluation.pool import Pool
 from dlo_calibration.model.action import Action, PATHS
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.trial import Goal, Trial
+from dlo_calibration.simulation.loads import Loads
 from dlo_calibration.simulation.motion import FRAME_RATE, MOST_FRAMES, Motion
 from dlo_calibration.simulation.protocol import Rollout, Simulator
 
@@ -54,6 +55,8 @@ class Rehearsal:
     :param settled: (k,) False where it did not come to rest within the time limit.
     :param trajectories: of each action, (m, n, 3) [m] the DLO while the hands move, at every TRAJECTORY_STEP;
         empty if they were not requested.
+    :param loads: the largest ones in each of the k actions, until the DLO rests; None if they were not
+        requested, after a failure, or if the engine does not know them.
     :param failure: why it could not be simulated, in words; empty if it could.
     """
 
@@ -61,6 +64,7 @@ class Rehearsal:
     settled: tuple[bool, ...]
     trajectories: tuple[Floats, ...] = ()
     failure: str = ''
+    loads: Loads | None = None
 
 
 @dataclass(frozen=True)
@@ -69,13 +73,15 @@ class RehearsalJob:
     A sequence of actions to rehearse.
 
     :param physical: parameters by name (SI units).
-    :param trajectories: whether the trajectory of the DLO in each action is wanted, too.
+    :param trajectories: whether the trajectory of the DLO in each action is wanted, too; `loads` whether the
+        loads are.
     """
 
     start: Chain
     steps: tuple[ActionStep, ...]
     physical: Mapping[str, float]
     trajectories: bool = False
+    loads: bool = False
 
 
 def in_turn(steps: Sequence[ActionStep], pause: float = PAUSE) -> tuple[ActionStep, ...]:
@@ -86,7 +92,8 @@ def in_turn(steps: Sequence[ActionStep], pause: float = PAUSE) -> tuple[ActionSt
     return tuple(placed)
 
 
-def rehearsed_trial(start: Chain, steps: Sequence[ActionStep], trajectories: bool = False) -> Trial:
+def rehearsed_trial(start: Chain, steps: Sequence[ActionStep], trajectories: bool = False,
+                    loads: bool = False) -> Trial:
     """Return a trial with the actions in turn; its goals are the DLO at rest after each."""
     steps, goals = in_turn(steps), []
     for step in steps:
@@ -96,7 +103,7 @@ def rehearsed_trial(start: Chain, steps: Sequence[ActionStep], trajectories: boo
             names = (*step.held_by, *(hand.name for hand in action.hands))
             goals += [Goal(start, float(time), stable=False, held_by=names) for time in times]
         goals.append(Goal(start, action.end + REST, held_by=step.held_by))
-    return Trial('rehearsal', start, tuple(step.action for step in steps), tuple(goals))
+    return Trial('rehearsal', start, tuple(step.action for step in steps), tuple(goals), loads=loads)
 
 
 def _instants(action: Action) -> Floats:
@@ -115,8 +122,8 @@ def rehearse(pool: Pool, jobs: Sequence[RehearsalJob]) -> list[Rehearsal]:
     :raises CancelledError: when the pool stops.
     """
     # Draws of the same actions share their trial, because a simulator scripts every trial anew.
-    keys = [(id(job.start), id(job.steps), job.trajectories) for job in jobs]
-    shared = {key: rehearsed_trial(job.start, job.steps, job.trajectories)
+    keys = [(id(job.start), id(job.steps), job.trajectories, job.loads) for job in jobs]
+    shared = {key: rehearsed_trial(job.start, job.steps, job.trajectories, job.loads)
               for key, job in dict(zip(keys, jobs, strict=True)).items()}
     trials = [shared[key] for key in keys]
     rollouts = pool.simulate([(trial, job.physical) for trial, job in zip(trials, jobs, strict=True)])
@@ -131,8 +138,10 @@ def _rehearsal(job: RehearsalJob, trial: Trial, rollout: Rollout | SimulationErr
                          failure=str(rollout))
     rests = [k for k, goal in enumerate(trial.goals) if goal.stable]
     trajectories = [rollout.chains[before + 1:rest] for before, rest in pairwise([-1, *rests])]
+    loads = None if rollout.loads is None else rollout.loads.over(
+        [slice(before + 1, rest + 1) for before, rest in pairwise([-1, *rests])])
     return Rehearsal(rollout.chains[rests], tuple(rollout.settled[k] for k in rests),
-                     tuple(trajectories) if job.trajectories else ())
+                     tuple(trajectories) if job.trajectories else (), loads=loads)
 
 
 class Rehearser:

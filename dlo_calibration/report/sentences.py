@@ -31,6 +31,7 @@ from dlo_calibration.model.parameters import (
 from dlo_calibration.model.score import MEAN_DISTANCE, SIMILAR, VERY_SIMILAR
 
 if TYPE_CHECKING:
+    from dlo_calibration.planning.loads import ActionLoads
     from dlo_calibration.planning.plan import Plan
     from dlo_calibration.planning.prediction import PredictedStep, Prediction
 
@@ -294,7 +295,8 @@ def plan_sentences(plan: Plan) -> list[str]:
     for k, action in enumerate(plan.actions, start=1):
         hands = '; '.join(_hand(plan.start, hand, 'drags', 2) for hand in action.action.hands)
         steps.append(f'{k}. {action.name}: {hands}; then the points are '
-                     f'{distance(plan, action.predicted)} from the goal on average.')
+                     f'{distance(plan, action.predicted)} from the goal on average.'
+                     f'{_borne(plan.start, action.loads)}')
     ended = [] if plan.reached else [f'The search ended: {plan.stop_reason}.']
     return [*steps, outcome(plan), *ended, *map(_sentence, plan.warnings)]
 
@@ -337,7 +339,19 @@ def prediction_sentences(prediction: Prediction) -> list[str]:
               f'{_place(step.chain[0])} m, the last one at {_place(step.chain[-1])} m, and the 90 % '
               f'intervals are {width(step)} wide on average'
               f'{"" if step.settled else "; the DLO did not come to rest"}.'
+              f'{_borne(prediction.start, step.loads)}'
               for k, step in enumerate(prediction.steps, start=1)), *prediction.warnings]
+
+
+def _borne(start: Chain, loads: ActionLoads | None) -> str:
+    """Say what the DLO bears in an action, after a blank; nothing if it is unknown."""
+    if loads is None:
+        return ''
+    bend, pull, _ = (f'{place / start.length:.2f} of the length' for place in loads.places)
+    radius = loads.least_bend_radius
+    bent = f'bends to a radius of {measured(radius, "m")} at {bend}' if radius < np.inf else 'stays straight'
+    return (f' It {bent}, and bears up to {measured(loads.most_tension, "N")} at {pull}, a strain of '
+            f'{number(100 * loads.most_strain)} %.')
 
 
 def width(step: PredictedStep) -> str:

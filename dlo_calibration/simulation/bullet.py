@@ -15,7 +15,7 @@ from contextlib import contextmanager
 import ctypes
 import os
 from tempfile import gettempdir
-from typing import Any, Iterator, Mapping, Sequence
+from typing import Any, Iterator, Mapping, Sequence, TYPE_CHECKING
 
 import numpy as np
 
@@ -29,6 +29,9 @@ from dlo_calibration.simulation.nodes import feature_shares, NodeLayout, spread_
 from dlo_calibration.simulation.protocol import DEFAULT_NODES, Rollout
 from dlo_calibration.simulation.scene import Obstacle, read_scene, stl_octets
 from dlo_calibration.writing import scratch_folder
+
+if TYPE_CHECKING:
+    from dlo_calibration.simulation.core._core import Outcome
 
 
 @contextmanager
@@ -283,7 +286,7 @@ class BulletRope:
         for body, point in zip(self.bodies, points.tolist(), strict=True):
             pybullet.resetBasePositionAndOrientation(body, point, IDENTITY, physicsClientId=self._client)
 
-    def follow(self, script: core.Script) -> tuple[Floats, tuple[bool, ...], int] | None:
+    def follow(self, script: core.Script) -> Outcome | None:
         """
         Follow the script of a trial from its start; return the outcome as `core.roll_out` does.
 

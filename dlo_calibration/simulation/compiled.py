@@ -8,13 +8,13 @@ from __future__ import annotations
 import copy
 from dataclasses import dataclass
 import threading
-from typing import Any, Mapping, Self, Sequence
+from typing import Any, Mapping, Self, Sequence, TYPE_CHECKING
 
 from dlo_calibration.errors import SimulationError
-from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.table import resting_level
 from dlo_calibration.simulation import core
+from dlo_calibration.simulation.loads import Loads
 from dlo_calibration.simulation.nodes import NodeLayout
 from dlo_calibration.simulation.protocol import (
     DEFAULT_NODES,
@@ -25,6 +25,9 @@ from dlo_calibration.simulation.protocol import (
 )
 from dlo_calibration.simulation.scene import core_scene, Obstacle
 from dlo_calibration.simulation.script import Script, Settling
+
+if TYPE_CHECKING:
+    from dlo_calibration.simulation.core._core import Outcome
 
 CACHE_SIZE = 1000  # prepared trials; a plan simulates each of its trials only once
 MOST_POSITIONS = 200_000  # of hands in the cached scripts: 100 MB if each hand holds four nodes
@@ -110,7 +113,7 @@ class Engine:
             del trials[next(iter(trials))]
         trials[id(prepared.trial)] = prepared
 
-    def _rollout(self, prepared: Prepared, outcome: tuple[Floats, tuple[bool, ...], int] | None) -> Rollout:
+    def _rollout(self, prepared: Prepared, outcome: Outcome | None) -> Rollout:
         """
         Return a rollout for an outcome of the core.
 
@@ -118,8 +121,9 @@ class Engine:
         """
         if outcome is None:
             raise SimulationError('the rollout diverged: the chain is no longer finite')
-        nodes, settled, steps = outcome
-        return Rollout(prepared.layout.observe @ nodes, settled, steps * self._time_step, steps)
+        nodes, settled, steps, measured = outcome
+        loads = Loads.measured(measured, prepared.layout.places) if measured is not None else None
+        return Rollout(prepared.layout.observe @ nodes, settled, steps * self._time_step, steps, loads)
 
     def refined(self) -> Self:
         """Return an engine with twice the segments and half the time step."""

@@ -15,6 +15,7 @@ from dlo_calibration.errors import SimulationError
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.simulation.core import Stop as Stop  # re-exported
+from dlo_calibration.simulation.loads import Loads
 
 # Defaults of both engines and of the options; doc/physics.md shows the small effect of a finer model.
 DEFAULT_NODES = 41
@@ -31,6 +32,8 @@ class Rollout:
         to rest within the time limit; its configuration at that time is compared.
     :param duration: simulated time [s].
     :param steps: number of time steps.
+    :param loads: the largest ones up to each of the g goals, since the goal before; None if the trial does
+        not ask for them, or the engine does not know them.
     :raises SimulationError: if a point is not finite.
     """
 
@@ -38,6 +41,7 @@ class Rollout:
     settled: tuple[bool, ...]
     duration: float
     steps: int
+    loads: Loads | None = None
 
     def __post_init__(self) -> None:
         chains = frozen_array(self.chains)

@@ -67,8 +67,8 @@ class Script:
         """
         writer = _Writer(trial, layout, time_step, settling)
         writer.write()
-        return cls(core.Script(writer.events, settling.distance, max(5, round(settling.time / time_step))),
-                   writer.positions)
+        steps = max(5, round(settling.time / time_step))
+        return cls(core.Script(writer.events, settling.distance, steps, trial.loads), writer.positions)
 
 
 @dataclass

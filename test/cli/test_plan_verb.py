@@ -89,6 +89,8 @@ def test_a_plan_is_found_and_its_files_lead_to_the_goal(run, chains, tmp_path):
     assert printed['reached'] and printed['error_after_m'] < 0.012 < printed['error_before_m']
     step, = printed['actions']
     assert step['name'] == 'grasp_and_place'
+    assert step['least_bend_radius_m'] > 0.02 and 0 < step['most_tension_n'] < 1
+    assert 0 < step['most_tension_at_m'] < 0.6 and 0 < step['most_strain'] < 0.01
     assert step['hands'][0]['name'] == 'hand_1' and step['hands'][0]['waypoints'][0][0] == 0
     assert set(printed) >= {
         'score_after', 'rollouts', 'seconds', 'stop_reason', 'error_after_percent_of_length'}
@@ -109,8 +111,20 @@ def test_each_action_is_described_and_whether_the_goal_is_reached(run, chains, p
     assert code == 0
     text = ' '.join(output.split())
     assert '1. grasp_and_place: hand_1 grips at 0.35 of the length, lifts 5 cm, carries it to' in text
+    assert ('from the goal on average. It bends to a radius of 50 mm at 0.35 of the length, and bears up to '
+            '1.5 N at 1.00 of the length, a strain of 1 %. 2. drag:') in text
     assert 'The goal is not reached: with 2 actions' in text
     assert text.endswith('The goal is longer than the DLO.')
+
+
+@pytest.mark.parametrize(('flags', 'words'), [
+    (('--least-bend-radius', 5), 'bent more sharply than least_bend_radius, 5000 mm'),
+    (('--most-tension', 0.001), 'pulled harder than most_tension, 0.001 N')])
+def test_a_limit_that_no_action_keeps_to_is_named(run, chains, flags, words):
+    code, output, _ = run('plan', ROPE, *chains, '--actions', 1, '--draws', 2, *flags, '--json')
+    printed = json.loads(output)
+    assert code == 0 and not printed['reached'] and printed['actions'] == []
+    assert any(words in remark for remark in printed['remarks'])
 
 
 def test_flags_are_the_options_of_the_plan_and_of_the_simulation(run, chains, planned):

@@ -67,6 +67,22 @@ def test_each_action_is_described_in_a_sentence(run, request_of):
     assert 'mm wide on average.' in text
 
 
+def test_a_rope_that_a_hand_holds_up_bears_its_weight(run, request_of):
+    up = straight().points[:, ::-1] * (1, 1, -1) + (0, 0, 1)
+    hand = Hand('hand', (0,), [0.0, 2.0], [up[0]] * 2)
+    request = request_of([Action((hand,))], start=Chain(up))
+    code, output, _ = run(RESULT, request, '--json', '--draws', 2, '--no-table')
+    action, = json.loads(output)['actions']
+    assert code == 0
+    assert action['most_tension_n'] == pytest.approx(0.03 * 9.81, rel=0.02)  # of dlo.xml: 30 g
+    assert action['most_tension_at_m'] == 0.0
+    lower, upper = action['most_tension_lower_upper_n']
+    assert lower <= action['most_tension_n'] <= upper < 0.4
+    assert action['most_strain'] > 0 and action['least_bend_radius_m'] > 0.01
+    output = ' '.join(run(RESULT, request, '--draws', 0, '--no-table')[1].split())
+    assert re.search(r'and bears up to 0\.29\d N at 0\.00 of the length, a strain of 0\.\d+ %\.', output)
+
+
 def test_json_has_the_actions_of_all_trials(run, request_of):
     trials = [PLACE], [Drag(point=10, direction=(0, 1, 0), distance=0.1)]
     code, output, _ = run(RESULT, request_of(*trials), '--json', '--draws', 2, '--seed', 3)

@@ -83,9 +83,10 @@ def test_sentences_say_what_each_hand_does_and_how_near_the_dlo_gets():
     first, second, end, _ = plan_sentences(made_up_plan())
     assert first == ('1. grasp_and_place: hand_1 grips at 0.35 of the length, lifts 5 cm, carries it to '
                      '(0.310, 0.120) m and opens; then the points are 56 mm (9.33 %) from the goal on '
-                     'average.')
-    assert second == ('2. drag: hand_2 grips at 0.00 of the length, drags it to (0.000, 0.100) m and opens; '
-                      'then the points are 6 mm (1 %) from the goal on average.')
+                     'average. It bends to a radius of 50 mm at 0.35 of the length, and bears up to 1.5 N at '
+                     '1.00 of the length, a strain of 1 %.')
+    assert second.startswith('2. drag: hand_2 grips at 0.00 of the length, drags it to (0.000, 0.100) m and '
+                             'opens; then the points are 6 mm (1 %) from the goal on average.')
     assert end.startswith('The goal is not reached: with 2 actions, the mean error goes from 106 mm '
                           '(17.7 %) to 7 mm (1.17 %), beyond the tolerance of 6 mm (1 %)')
 

@@ -59,16 +59,18 @@ def test_status_names_what_it_waits_for(started):
 
 def test_a_plan_is_published_as_steps_action_and_markers(started):
     plan = ToyPlan()
-    graph = started(plan, tolerance=2.0)
+    graph = started(plan, tolerance=2.0, least_bend_radius=0.02, most_tension=5.0)
     graph.send_chains(CHAIN, MOVED)
     status = graph.planned()
     (described, start, goal, options, simulation), = plan.calls
     assert np.array_equal(start.points, CHAIN.points) and np.array_equal(goal.points, MOVED.points)
-    assert options == PlannerOptions(tolerance=2.0)
+    assert options == PlannerOptions(tolerance=2.0, least_bend_radius=0.02, most_tension=5.0)
     assert described.values == read_result(RESULT).values
     assert simulation == read_result(RESULT).file_options.options()
     steps, = graph.steps
     assert [action['name'] for action in steps['actions']] == ['grasp_and_place', 'drag']
+    assert [(action['least_bend_radius_m'], action['least_bend_radius_at_m'], action['most_tension_n'])
+            for action in steps['actions']] == 2 * [(0.05, 0.21, 1.5)]
     assert steps.keys() == plain_plan(plan(*plan.calls[0][:4], simulation=None, on_progress=id,
                                            should_stop=bool)).keys()
     assert (status['actions'], status['reached'], status['plans']) == ('2', 'false', '1')

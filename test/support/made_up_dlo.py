@@ -13,6 +13,7 @@ from dlo_calibration.calibration.result import ParameterEstimate
 from dlo_calibration.model.named_actions import Drag, GraspAndPlace
 from dlo_calibration.model.parameters import PAPER_PARAMETERS, ParameterSpace
 from dlo_calibration.model.score import PointErrors
+from dlo_calibration.planning.loads import ActionLoads
 from dlo_calibration.planning.plan import Plan, PlannedAction
 
 LENGTH = 0.6  # m
@@ -64,6 +65,9 @@ def arc(angle=1.0, points=21, length=LENGTH, height=LEVEL):
 
 
 AWAY = ((0.0, 0.05, 0.0), (0.0, 0.1, 0.0))  # m, from the start to the DLO after each action
+#: Sharpest curvature [1/m], largest tension [N], largest strain, and where [m].
+LOADS = ActionLoads(np.array([20.0, 1.5, 0.01]), np.array([0.21, 0.6, 0.57]), np.array([18.0, 1.2, 0.008]),
+                    np.array([25.0, 1.9, 0.02]))
 MOVES = (GraspAndPlace(start=0.0, point=7, to=(0.31, 0.12, 0.004), hand='hand_1'),
          Drag(start=0.0, point=0, to=(0.0, 0.1, 0.004), hand='hand_2'))
 
@@ -72,7 +76,8 @@ def made_up_plan(start: Chain | None = None, actions: int = 2, **changes) -> Pla
     """Return a plan of at most two actions, the last of which ends 6 mm from its goal."""
     start = start or straight()
     after = [start.points + np.array(away) for away in AWAY]
-    done = tuple(PlannedAction(move.name, move.action(Chain(before)), points, points - 0.01, points + 0.01)
+    done = tuple(PlannedAction(move.name, move.action(Chain(before)), points, points - 0.01, points + 0.01,
+                               LOADS)
                  for move, before, points in zip(MOVES, [start.points, *after], after, strict=False))
     return Plan(**{**{
         'start': start, 'goal': Chain(after[-1] + (0.0, 0.006, 0.0)), 'actions': done[:actions],

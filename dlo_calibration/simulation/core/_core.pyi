@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 #: kinds of processors whose code this processor can execute, the fastest first; all give the same bits
 TARGETS: tuple[str, ...]
 
+Outcome = tuple[NDArray[np.float64], tuple[bool, ...], int, NDArray[np.float64] | None]  # see `roll_out`
+
 class Start:
     """
     Where a DLO of N nodes is at the start of a trial.
@@ -85,9 +87,11 @@ class Script:
 
     :param stable_distance: the DLO is stable when no node moves as far as this [m] within `stable_steps`.
     :param stable_steps: at least 5.
+    :param loads: whether the loads of the DLO are measured after each step.
     """
 
-    def __init__(self, events: Sequence[Event], stable_distance: float, stable_steps: int) -> None: ...
+    def __init__(self, events: Sequence[Event], stable_distance: float, stable_steps: int,
+                 loads: bool = False) -> None: ...
 
 class Body:
     """
@@ -131,7 +135,7 @@ class Stop:
 
 def roll_out(jobs: Sequence[tuple[Script, Start, Mapping[str, float], float]], time_step: float,
              stop: Stop | None = None, target: str = '', scene: Scene | None = None
-             ) -> list[tuple[NDArray[np.float64], tuple[bool, ...], int] | None]:
+             ) -> list[Outcome | None]:
     """
     Simulate jobs.  Any number of threads may call this; an outcome does not depend on the other jobs.
 
@@ -141,8 +145,10 @@ def roll_out(jobs: Sequence[tuple[Script, Start, Mapping[str, float], float]], t
     :param target: one of `TARGETS`; empty: the fastest.
     :param scene: around the DLO of each job; None: nothing.
     :returns: for each job the nodes at the goals (g, N, 3) [m], whether the DLO was stable at each goal that
-        is a stable configuration (else True), and the number of steps; None if the rollout diverged.  After
-        a stop, outcomes are meaningless.
+        is a stable configuration (else True), the number of steps, and the loads; None if the rollout
+        diverged.  The loads (g, 3, 2) are the sharpest curvature [1/m], the largest tension [N] and the
+        largest strain since the goal before, each with its place: the index of a node, or the middle between
+        two; None if the script does not ask for them.  After a stop, outcomes are meaningless.
     """
 
 class Rope:
@@ -192,8 +198,7 @@ class Rope:
     def step(self) -> bool:
         """Take a step on the table and in the scene; return whether the rope is still finite."""
 
-    def follow(self, script: Script, step: Callable[[], Any]
-               ) -> tuple[NDArray[np.float64], tuple[bool, ...], int] | None:
+    def follow(self, script: Script, step: Callable[[], Any]) -> Outcome | None:
         """
         Follow a script; return the outcome as `roll_out` does.
 

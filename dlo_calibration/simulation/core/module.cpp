@@ -178,11 +178,12 @@ Event make_advance(std::vector<std::shared_ptr<const Grip>> grips, int count, bo
 
 Event make_see(std::optional<double> share) { return {See{!share, require_share(share.value_or(1.0))}}; }
 
-Script make_script(std::vector<std::shared_ptr<const Event>> events, double distance, int steps) {
+Script make_script(std::vector<std::shared_ptr<const Event>> events, double distance, int steps,
+                   bool loads) {
   require(steps >= kFewestStableSteps && steps <= kMostStableSteps,
           "stable_steps: ", steps, "; expected ", kFewestStableSteps, " to ", kMostStableSteps,
           "; change the time step");
-  Script script{std::move(events), {distance, steps}, 0, 0};
+  Script script{std::move(events), {distance, steps}, 0, 0, loads};
   std::size_t held = 0;
   const auto need = [&](const std::vector<int>& nodes) {
     for (int node : nodes) script.nodes = std::max(script.nodes, node + 1);
@@ -295,14 +296,20 @@ void require_fit(const Script& script, std::size_t nodes) {
           " nodes; expected at most the ", nodes, " of the DLO; write the script for this DLO");
 }
 
-/// Nodes at the goals (g, N, 3), settled (g,), and steps; None: the rollout diverged.
+/// Nodes at the goals (g, N, 3), settled (g,), steps, and loads (g, 3, 2), or None if they were not measured;
+/// None: the rollout diverged.
 py::object answer(const Outcome& outcome) {
   const std::size_t nodes = outcome.seen.empty() ? 0 : outcome.seen[0].size();
   Array seen({outcome.seen.size(), nodes, std::size_t{3}});
   for (std::size_t k = 0; k < outcome.seen.size(); ++k)
     std::copy_n(&outcome.seen[k][0].x, 3 * nodes, seen.mutable_data(k, 0, 0));
   if (outcome.diverged || !all_finite(seen)) return py::none();
-  return py::make_tuple(seen, py::tuple(py::cast(outcome.settled)), outcome.steps);
+  py::object loads = py::none();
+  if (!outcome.loads.empty()) {
+    static_assert(sizeof(Loads) == 6 * sizeof(double));
+    loads = Array({outcome.loads.size(), std::size_t{3}, std::size_t{2}}, &outcome.loads[0].curvature.value);
+  }
+  return py::make_tuple(seen, py::tuple(py::cast(outcome.settled)), outcome.steps, loads);
 }
 
 py::list roll_out(const std::vector<JobTuple>& tuples, double time_step, const Stop* stop,
@@ -430,7 +437,7 @@ PYBIND11_MODULE(_core, module) {
                   "remembers"_a = false, "sights"_a = std::vector<std::pair<int, double>>{})
       .def_static("see", &make_see, "share"_a = py::none());
   py::class_<Script, std::shared_ptr<Script>>(module, "Script", py::module_local())
-      .def(py::init(&make_script), "events"_a, "stable_distance"_a, "stable_steps"_a);
+      .def(py::init(&make_script), "events"_a, "stable_distance"_a, "stable_steps"_a, "loads"_a = false);
   py::class_<Body, std::shared_ptr<Body>>(module, "Body", py::module_local())
       .def(py::init([](const std::string& shape, const Array& sizes, const Array& position, const Array& turn,
                        double friction) {

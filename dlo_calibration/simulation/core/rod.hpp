@@ -174,6 +174,23 @@ inline void solve(Rods<Number>& rods) {
   rods.solved = select(finite(total) & (smallest > 0.0), none + 1.0, none);
 }
 
+/// Compute the tensions that the springs transmit in a step, as its equations have them: the force of the
+/// spring and what its implicit damping adds.  The stretch alone would say too much wherever the step then
+/// changes velocities by contact, or the segment turns: the damping opposes the way back.
+template <class Number>
+inline void find_tensions(Rods<Number>& rods) {
+  const double step = rods.step;
+  const auto *points = rods.points.data(), *velocities = rods.predicted.data();
+  const auto* springs = rods.springs.data();
+  auto* tensions = rods.tensions.data();
+  for (int i = 0; i + 1 < rods.nodes; ++i) {
+    const Vec3<Number> segment = points[i + 1] - points[i], apart = velocities[i + 1] - velocities[i];
+    const Number square = dot(segment, segment);
+    const auto& [across, along, impulse] = springs[i];
+    tensions[i] = (impulse * square + (along * square + across) * dot(segment, apart)) / (step * sqrt(square));
+  }
+}
+
 /// Upper bounds [m] of the relative movement of any two nodes, and of two neighbours, in a step.
 template <class Number>
 inline std::array<Number, 2> movement(const std::vector<Vec3<Number>>& rows, double step) {

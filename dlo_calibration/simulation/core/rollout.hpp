@@ -8,6 +8,7 @@
 
 #include "script.hpp"
 #include "step.hpp"
+#include "loads.hpp"
 
 namespace dlo {
 namespace DLO_TARGET {
@@ -25,7 +26,10 @@ void copy_out(std::vector<Vec3<Number>>& rows, int lane, std::vector<Point>& to)
 class Rollout {
  public:
   Rollout(const Script& script, Rope& rope, Outcome& outcome)
-      : rope(rope), outcome(outcome), script_(script), offsets_(script.rows), before_(rope.rods.points) {}
+      : rope(rope), outcome(outcome), script_(script), offsets_(script.rows), before_(rope.rods.points) {
+    rope.rods.measured = script.loads;
+    rope.rods.resize();
+  }
 
   /// Go on to the next move; return whether there is one.
   bool next() {
@@ -60,6 +64,7 @@ class Rollout {
     outcome.diverged = in_lane(rods.solved, lane) != 1.0;
     if (outcome.diverged) return true;
     ++steps_, ++outcome.steps;
+    if (script_.loads) meter_.measure(rods, lane, rope);
     const bool last = steps_ == move_->count;
     if (!move_->sights.empty()) {
       copy_out(rods.points, lane, now_);
@@ -107,6 +112,7 @@ class Rollout {
 
   void see_now(const std::vector<Point>& now, double share, bool rests) {
     outcome.seen.push_back(now);
+    if (script_.loads) outcome.loads.push_back(meter_.take());
     if (rests) return;
     auto& seen = outcome.seen.back();
     for (std::size_t i = 0; i < seen.size(); ++i) seen[i] = before_[i] + share * (now[i] - before_[i]);
@@ -146,6 +152,7 @@ class Rollout {
   std::vector<Point> offsets_;  // of nodes from the hands that hold them
   std::vector<Point> before_;   // remembered points, where the next sight begins
   std::vector<Point> now_;      // workspace
+  LoadMeter meter_;
   bool rests_ = false;          // the DLO has come to rest since the last event
   const Advance* move_ = nullptr;
   int steps_ = 0;  // of the move, so far
@@ -227,6 +234,7 @@ class LaneGroup {
       rods_ = Rods<Lanes>();
       rods_.nodes = first.nodes, rods_.step = first.step, rods_.gravity = first.gravity;
       rods_.framed = first.framed, rods_.twists = first.twists, rods_.strands_rub = first.strands_rub;
+      rods_.measured = first.measured;
       rods_.resize();
     }
     for (Rollout* rollout : rollouts)

@@ -82,6 +82,7 @@ struct Rods {
   bool framed = false;   // it has a material frame: its rest shape is curved, or it resists twist
   bool twists = false;   // it resists twist; else the frame turns freely as a whole
   bool strands_rub = false;
+  bool measured = false;  // its tensions are found in each step
   double step = 0.0;     // [s]
   Point gravity{};       // [m/s^2]
 
@@ -114,6 +115,7 @@ struct Rods {
   std::vector<Vec3<Number>> tangents, across;
   std::vector<Number> inverse_lengths, clamped, prescribed, turning, upper;
   std::vector<StrandForce<Number>> strand_forces;
+  std::vector<Number> tensions;        // [N] of the segments, in the last step
   Number solved;                       // 1 where the last step was finite
   std::array<Number, 2> last_moves{};  // in the last step, see `Movement`
   std::array<Number, 2> next_moves;    // in this step, without contact
@@ -135,13 +137,14 @@ struct Rods {
     joints.resize(framed ? inner : 0), bishop.resize(framed ? 2 : 0);
     strands.resize(strands_rub ? inner : 0), plastic.resize(strands_rub ? inner : 0);
     strand_forces.resize(strands_rub ? n : 0);
+    tensions.resize(measured ? segments : 0);
   }
 
   /// Whether it can be stepped together with another DLO.
   template <class Other>
   bool is_like(const Rods<Other>& other) const {
     return nodes == other.nodes && framed == other.framed && twists == other.twists &&
-           strands_rub == other.strands_rub && step == other.step;
+           strands_rub == other.strands_rub && measured == other.measured && step == other.step;
   }
 };
 

@@ -74,6 +74,7 @@ struct Script {
   Settling settling;
   int rows = 0;   // of the table of offsets
   int nodes = 0;  // least number of nodes of a DLO
+  bool loads = false;  // they are measured after each step
 };
 
 /// A trial to simulate with a parameter set.
@@ -86,10 +87,21 @@ struct Job {
   std::shared_ptr<const Scene> scene;  // around it; none: nothing
 };
 
+/// The largest value of a load, and where: the index of a node, or the middle between two.
+struct Load {
+  double value = 0.0, place = 0.0;
+};
+
+/// Largest loads in some time; a DLO that is straight, slack and nowhere stretched has none.
+struct Loads {
+  Load curvature, tension, strain;  // [1/m], [N], -
+};
+
 /// The result of a rollout.
 struct Outcome {
   std::vector<std::vector<Point>> seen;  // nodes at each goal [m]
   std::vector<bool> settled;             // for each goal; false: it is a stable one, and the DLO did not rest
+  std::vector<Loads> loads;              // for each goal, since the one before; empty if not asked for
   int steps = 0;
   bool diverged = false;
 };

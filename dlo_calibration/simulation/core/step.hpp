@@ -82,6 +82,7 @@ void predict(Rods<Number>& rods, const Ropes& ropes) {
   each_held(ropes, [&](int lane, int node, const Point& velocity, const Point&) {
     set_lane(rods.predicted[node], lane, velocity);
   });
+  if (rods.measured) find_tensions(rods);
   rods.last_moves = movement(rods.velocities, step);
   rods.next_moves = movement(rods.predicted, step);
   for (std::size_t lane = 0; lane < ropes.size(); ++lane) {
