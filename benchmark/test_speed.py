@@ -159,10 +159,10 @@ def test_parts(benchmark, nodes, tables, monkeypatch):
     simulator, roll_out = CompiledSimulator(nodes=nodes), core.roll_out
     whole, inside = [], []
 
-    def watched(*arguments):
+    def watched(*arguments, **named):
         begun = time.process_time()
         try:
-            return roll_out(*arguments)
+            return roll_out(*arguments, **named)
         finally:
             inside[-1] += time.process_time() - begun
 

@@ -18,7 +18,8 @@ MARGIN = 0.012  # m around the mesh; further away, the core extrapolates
 NEAR = 4.0  # cells; up to here, distances are exact
 SAMPLES = 2  # per cell and direction, on the surface
 CANDIDATES = 4  # nearest samples whose triangles are tried
-MOST_SAMPLES = 4_000_000
+MOST_SAMPLES = 2_000_000
+MOST_CROSSINGS = 20_000_000  # of columns of the grid with triangles; a closed surface has some 10,000
 TILT = 1e-6, 1.618e-6  # of a cell: so that no column of the grid meets an edge of a regular mesh
 
 
@@ -41,7 +42,7 @@ class DistanceGrid:
         """
         Return the grid of a mesh of (t, 3, 3) [m] triangles, of any orientation.
 
-        :raises ValueError: if the mesh is not closed.
+        :raises ValueError: if the mesh is not closed, or folded too often.
         """
         return _grid(np.ascontiguousarray(triangles, dtype=float).tobytes())
 
@@ -52,6 +53,8 @@ def _grid(octets: bytes) -> DistanceGrid:
     triangles = _closed(triangles)
     low, high = triangles.min(axis=(0, 1)) - MARGIN, triangles.max(axis=(0, 1)) + MARGIN
     cell = float(np.cbrt(np.prod(high - low) / MOST_POINTS))
+    while np.prod(np.ceil((high - low) / cell) + 1) > 1.2 * MOST_POINTS:  # a long and thin mesh
+        cell *= 1.2
     counts = np.ceil((high - low) / cell).astype(int) + 1
     axes = [start + cell * np.arange(count) for start, count in zip(low, counts, strict=True)]
     distances = _distances(axes, triangles, cell)
@@ -138,7 +141,7 @@ def _squares(points: Floats, triangles: Floats) -> Floats:
         inside &= _dot(np.cross(side, away), normals) >= 0
     areas = np.maximum(_dot(normals, normals), 1e-300)
     above = _dot(points - triangles[:, 0], normals)**2 / areas
-    return np.where(inside, np.minimum(best, above), best)
+    return np.where(inside & (areas > 1e-300), np.minimum(best, above), best)
 
 
 def _dot(a: Floats, b: Floats) -> Floats:
@@ -146,7 +149,11 @@ def _dot(a: Floats, b: Floats) -> Floats:
 
 
 def _inside(axes: list[Floats], triangles: Floats, cell: float) -> NDArray[np.bool_]:
-    """Return which points of a grid lie inside: below an odd number of crossings of their column."""
+    """
+    Return which points of a grid lie inside: above an odd number of crossings of their column.
+
+    :raises ValueError: if there are too many crossings.
+    """
     xs, ys = axes[0] + TILT[0] * cell, axes[1] + TILT[1] * cell
     counts = [len(axis) for axis in axes]
     crossings = np.zeros((counts[0], counts[1], counts[2] + 1), np.int32)
@@ -155,7 +162,9 @@ def _inside(axes: list[Floats], triangles: Floats, cell: float) -> NDArray[np.bo
     high = np.stack([np.searchsorted(xs, triangles[:, :, 0].max(axis=1)),
                      np.searchsorted(ys, triangles[:, :, 1].max(axis=1))], axis=1)
     wide, deep = (high - low).T
-    for chunk in np.array_split(np.arange(len(triangles)), max(1, int((wide * deep).sum()) // 2_000_000)):
+    if (columns := int((wide * deep).sum())) > MOST_CROSSINGS:
+        raise ValueError(f'a mesh whose triangles lie above each other {columns // np.prod(counts[:2])} times')
+    for chunk in np.array_split(np.arange(len(triangles)), 1 + columns // 2_000_000):
         number = wide[chunk] * deep[chunk]
         which = np.repeat(chunk, number)
         at = np.arange(len(which)) - np.repeat(np.cumsum(number) - number, number)
@@ -168,7 +177,7 @@ def _inside(axes: list[Floats], triangles: Floats, cell: float) -> NDArray[np.bo
             s = ((x - a[:, 0]) * (c[:, 1] - a[:, 1]) - (c[:, 0] - a[:, 0]) * (y - a[:, 1])) / area
             t = ((b[:, 0] - a[:, 0]) * (y - a[:, 1]) - (x - a[:, 0]) * (b[:, 1] - a[:, 1])) / area
             hit = (s >= 0) & (t >= 0) & (s + t <= 1)
-        z = a[:, 2] + s * (b[:, 2] - a[:, 2]) + t * (c[:, 2] - a[:, 2])
+            z = a[:, 2] + s * (b[:, 2] - a[:, 2]) + t * (c[:, 2] - a[:, 2])
         k = np.searchsorted(axes[2], z[hit])
         np.add.at(crossings, (i[hit], j[hit], k), 1)
     return np.asarray(np.cumsum(crossings, axis=2)[:, :, :-1] % 2 == 1)

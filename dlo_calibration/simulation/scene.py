@@ -114,7 +114,7 @@ def core_scene(obstacles: Sequence[Obstacle]) -> core.Scene:
     """
     Return obstacles as bodies of the core; a mesh becomes a `DistanceGrid`.
 
-    :raises InputError: if a mesh is not closed.
+    :raises InputError: if a mesh has no inside.
     """
     return core.Scene([_body(obstacle) for obstacle in obstacles])
 

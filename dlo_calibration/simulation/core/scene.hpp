@@ -6,7 +6,6 @@
 
 #include <array>
 #include <memory>
-#include <utility>
 #include <vector>
 
 #include "vectors.hpp"
@@ -46,13 +45,19 @@ struct Touch {
   Point impulse{};              // all of it in the last solution [N s]
 };
 
+/// A body and a segment whose gap is within the Verlet skin.
+struct Near {
+  int body, segment;
+  double room;  // [m] that any node may move until they can touch
+};
+
 /// Contact is that of the capsules around the segments, so that nothing passes between two nodes.  What lies in
 /// a body at the start may stay there until it has left: a radius that is too large does not throw the DLO away.
 struct SceneContact {
   std::shared_ptr<const Scene> scene;
   double radius = 0.0, friction = 0.0;
   std::vector<double> allowed;             // [m] least gap, for each body at each node and between two nodes
-  std::vector<std::pair<int, int>> near;   // bodies and segments whose gap is within the Verlet skin
+  std::vector<Near> near;                  // sorted
   double room = -1.0;                      // [m] that any node may move until `near` is out of date
   std::vector<Touch> touches, former;      // sorted by body, node and `between`
 };

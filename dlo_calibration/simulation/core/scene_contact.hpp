@@ -14,7 +14,7 @@ namespace DLO_TARGET {
 
 constexpr double kRigid = 1e6;        // weight of the equation of a contact, relative to the mass that it moves
 constexpr double kCreep = 1e-6;       // m/s; slower sliding counts as none
-constexpr double kFrictionError = 0.1;  // share of the friction by which it may be late
+constexpr double kFrictionError = 0.3;  // share of the largest friction by which it may be late
 constexpr int kSolutions = 4, kMostSolutions = 10;  // of the equations of a step; the later ones only release
 constexpr double kLeft = 1e-4;        // m; a gap with which the DLO has left a body
 constexpr double kCorrected = 0.08;   // share of a penetration that one step corrects, as on the table
@@ -107,7 +107,8 @@ inline Field field_of(const Body& body, const Point& at) {
   return {field.distance, m * field.gradient};
 }
 
-/// A place between two points that is nearer to a body than both; without one, `share` is negative.
+/// A place between two points that is nearer to a body than both; `share` is negative if there is none, or if it
+/// is further away than asked for: then the distance is a lower bound.
 struct Between {
   double share;
   Field field;
@@ -116,10 +117,12 @@ struct Between {
 /// The distance from a convex body has at most one minimum along a segment: where its slope is 0, found by
 /// the method of false position (the Illinois variant).
 inline Between nearest_between(const Body& body, const Point& a, const Point& b, const Field& at_a,
-                               const Field& at_b) {
+                               const Field& at_b, double furthest) {
   const Point along = b - a;
   double low = 0.0, high = 1.0, down = dot(at_a.gradient, along), up = dot(at_b.gradient, along);
-  if (!(down < 0.0 && up > 0.0)) return {-1.0, {}};
+  if (!(down < 0.0 && up > 0.0)) return {-1.0, {HUGE_VAL, {}}};
+  const double crossing = at_a.distance + down * (at_b.distance - up - at_a.distance) / (down - up);
+  if (crossing > furthest) return {-1.0, {crossing, {}}};  // of the tangents
   const double flat = 1e-6 * sqrt(dot(along, along));
   int side = 0;
   Between best{};
@@ -164,28 +167,36 @@ inline void find_near(SceneContact& contact, const Point* points, int nodes, dou
       const double within = sqrt(dot(half, half)) + far;
       const Point apart = middle - body.position;
       if (sqrt(dot(apart, apart)) > body.reach + within) continue;
-      if (field_of(body, middle).distance <= within) contact.near.push_back({k, i});
+      const double beyond = field_of(body, middle).distance - within;
+      if (beyond <= 0.0) contact.near.push_back({k, i, max(beyond + reach, 0.0)});
     }
   }
 }
 
-/// Call `act(body, node, share, field)` for each node of the near segments, and for each place between two
-/// nodes that is nearer to a body than both; share < 0: it is the node.
+/// Call `gap = act(body, node, share, field)` for each node of the near segments that can touch before any
+/// node has moved by `coming` [m], and for each place between two nodes that is nearer to a body than both;
+/// share < 0: it is the node.  Set their room.
 template <class Act>
-inline void each_place(const SceneContact& contact, const Point* points, Act act) {
+inline void each_place(SceneContact& contact, const Point* points, double coming, Act act) {
   int body = -1, node = -1;
+  double gap = 0.0;
   Field first{};
-  for (const auto& [k, i] : contact.near) {
-    const Body& at = contact.scene->bodies[k];
-    if (k != body || i != node) {
+  for (Near& near : contact.near) {
+    if (near.room > coming) continue;
+    const int i = near.segment;
+    const Body& at = contact.scene->bodies[near.body];
+    if (near.body != body || i != node) {
       first = field_of(at, points[i]);
-      act(k, i, -1.0, first);
+      gap = act(near.body, i, -1.0, first);
     }
     const Field second = field_of(at, points[i + 1]);
-    const Between between = nearest_between(at, points[i], points[i + 1], first, second);
-    if (between.share >= 0.0) act(k, i, between.share, between.field);
-    act(k, i + 1, -1.0, second);
-    body = k, node = i + 1, first = second;
+    const Between between =
+        nearest_between(at, points[i], points[i + 1], first, second, contact.radius + coming);
+    gap = min(gap, between.share < 0.0 ? between.field.distance - contact.radius
+                                       : act(near.body, i, between.share, between.field));
+    const double next = act(near.body, i + 1, -1.0, second);
+    near.room = max(min(gap, next), 0.0);
+    body = near.body, node = i + 1, first = second, gap = next;
   }
 }
 
@@ -196,22 +207,25 @@ inline std::size_t place_of(const SceneContact& contact, int body, int node, boo
 /// Let what lies in a body at the start stay there.
 inline void begin(SceneContact& contact, const Point* points, int nodes) {
   find_near(contact, points, nodes, 0.0);
-  each_place(contact, points, [&](int body, int node, double share, const Field& field) {
+  each_place(contact, points, HUGE_VAL, [&](int body, int node, double share, const Field& field) {
     const double gap = field.distance - contact.radius;
-    if (!(gap < 0.0)) return;
+    if (!(gap < 0.0)) return gap;
     if (contact.allowed.empty()) contact.allowed.assign(2 * contact.scene->bodies.size() * nodes, 0.0);
     double& allowed = contact.allowed[place_of(contact, body, node, share >= 0.0)];
     allowed = min(allowed, gap);
+    return gap;
   });
   contact.near.clear();
 }
 
-/// Find the places that may touch a body in this step; those that did in the last one keep their state.
-inline void find_touches(SceneContact& contact, const Point* points, const double* inverse_masses, double step) {
+/// Find the places that may touch a body before a node has moved by `coming` [m]; those that touched it in the
+/// last step keep their state.
+inline void find_touches(SceneContact& contact, const Point* points, const double* inverse_masses, double step,
+                         double coming) {
   contact.former.swap(contact.touches);
   contact.touches.clear();
   auto last = contact.former.begin();
-  each_place(contact, points, [&](int body, int node, double share, const Field& field) {
+  each_place(contact, points, coming, [&](int body, int node, double share, const Field& field) {
     const bool between = share >= 0.0;
     double gap = field.distance - contact.radius;
     if (!contact.allowed.empty()) {
@@ -223,13 +237,14 @@ inline void find_touches(SceneContact& contact, const Point* points, const doubl
     if (between) touch.weights = {1.0 - share, share};
     touch.mobility = touch.weights[0] * touch.weights[0] * inverse_masses[node];
     if (between) touch.mobility += touch.weights[1] * touch.weights[1] * inverse_masses[node + 1];
-    if (!(touch.mobility > 0.0)) return;  // a hand holds it
+    if (!(touch.mobility > 0.0)) return gap;  // a hand holds it
     touch.least = gap > -kAllowed ? -(gap + kAllowed) / step : -kCorrected * (gap + kAllowed) / step;
     const auto key = [&](const Touch& t) { return 2 * (t.body * 1LL * kMostNodes + t.node) + t.between; };
     while (last != contact.former.end() && key(*last) < key(touch)) ++last;
     if (last != contact.former.end() && key(*last) == key(touch))
       touch.pushes = last->pushes && gap < kLeft, touch.drag = last->drag;
     contact.touches.push_back(touch);
+    return gap;
   });
 }
 
@@ -272,9 +287,10 @@ inline Point velocity_at(const Touch& touch, std::vector<Vec3<Number>>& velociti
 }
 
 /// Take from a solution which bodies push and how the DLO slides; return whether that needs another solution.
-/// A body that pulls always does; `last`: nothing else does.
+/// A body that pulls always does; friction only at `first`, as it follows from step to step; nothing else does at
+/// `last`.
 template <class Number>
-inline bool learn(Rods<Number>& rods, SceneContact& contact, int lane, bool last) {
+inline bool learn(Rods<Number>& rods, SceneContact& contact, int lane, bool first, bool last) {
   bool changed = false;
   for (Touch& touch : contact.touches) {
     const Point velocity = velocity_at(touch, rods.predicted, lane);
@@ -298,7 +314,7 @@ inline bool learn(Rods<Number>& rods, SceneContact& contact, int lane, bool last
     // If friction has held the DLO with more than it can, the speed is at most that of the mass alone.
     const double limit = coefficient * touch.push, beyond = touch.drag * speed - limit;
     const double other = limit / max(max(speed, beyond * touch.mobility), kCreep);
-    changed = changed || (!last && abs(other - touch.drag) * speed > kFrictionError * limit);
+    changed = changed || (first && abs(other - touch.drag) * speed > kFrictionError * limit);
     touch.drag = other;
   }
   return changed;
@@ -316,18 +332,22 @@ inline void solve_among_bodies(Rods<Number>& rods, const Ropes& ropes) {
   };
   Number moved = furthest(rods.velocities);
   std::array<bool, kLanes> open{};
-  const auto find = [&](Rope& rope, int lane) {
+  const auto current = [&](Rope& rope, int lane) {
     if constexpr (lanes_of<Number> > 1)
       for (int i = 0; i < rods.nodes; ++i) rope.rods.points[i] = in_lane(rods.points[i], lane);
-    find_touches(rope.surroundings, rope.rods.points.data(), rope.inverse_masses.data(), step);
+    return rope.rods.points.data();
+  };
+  const auto find = [&](Rope& rope, int lane, double by) {
+    find_touches(rope.surroundings, current(rope, lane), rope.inverse_masses.data(), step, by);
   };
   for (std::size_t lane = 0; lane < ropes.size(); ++lane) {
     SceneContact& contact = ropes[lane]->surroundings;
     if (!contact.scene) continue;
     open[lane] = true;
     contact.room -= in_lane(moved, lane);
+    for (Near& near : contact.near) near.room -= in_lane(moved, lane);
     if (contact.near.empty()) continue;
-    find(*ropes[lane], lane);
+    find(*ropes[lane], lane, in_lane(moved, lane));
     write_touches(rods, contact, lane);
   }
   solve(rods);
@@ -338,15 +358,19 @@ inline void solve_among_bodies(Rods<Number>& rods, const Ropes& ropes) {
       Rope& rope = *ropes[lane];
       SceneContact& contact = rope.surroundings;
       if (!open[lane] || in_lane(rods.solved, lane) != 1.0) continue;
-      if (k == 1 && contact.room < in_lane(coming, lane)) {
-        const double skin = min(max(kThinSkin, kSkinSteps * in_lane(coming, lane)), kThickSkin);
-        contact.room = in_lane(coming, lane) + skin;
-        if constexpr (lanes_of<Number> > 1)
-          for (int i = 0; i < rods.nodes; ++i) rope.rods.points[i] = in_lane(rods.points[i], lane);
-        find_near(contact, rope.rods.points.data(), rods.nodes, contact.room);
-        find(rope, lane);
+      if (k == 1) {
+        const double by = in_lane(coming, lane);
+        if (contact.room < by) {
+          const double skin = min(max(kThinSkin, kSkinSteps * by), kThickSkin);
+          contact.room = by + skin;
+          find_near(contact, current(rope, lane), rods.nodes, contact.room);
+          find(rope, lane, by);
+        } else if (by > in_lane(moved, lane)) {
+          const auto unseen = [&](const Near& near) { return near.room > in_lane(moved, lane) && near.room <= by; };
+          if (std::any_of(contact.near.begin(), contact.near.end(), unseen)) find(rope, lane, by);
+        }
       }
-      open[lane] = learn(rods, contact, lane, k >= kSolutions) && k < kMostSolutions;
+      open[lane] = learn(rods, contact, lane, k == 1, k >= kSolutions) && k < kMostSolutions;
       if (open[lane]) write_touches(rods, contact, lane);
       again = again || open[lane];
     }
