@@ -17,6 +17,7 @@ from dlo_calibration.simulation.bullet import BulletSimulator
 from dlo_calibration.simulation.compiled import CompiledSimulator
 from dlo_calibration.simulation.loads import CURVATURE, STRAIN, TENSION
 from dlo_calibration.simulation.protocol import Stop
+from dlo_calibration.simulation.scene import NO_TRIANGLES, Obstacle
 
 LENGTH, MASS, LEVEL = 0.6, 0.03, 0.004
 ROPE = {'flexibility': 1e-4, 'elasticity': 300.0, 'friction': 0.5, 'self_collision': LEVEL, 'mass': MASS,
@@ -71,10 +72,13 @@ def test_the_tension_of_a_hanging_rope_is_the_weight_below(make, elasticity):
 
 
 def test_where_a_rope_hangs_from_its_middle_each_half_bears_its_own_weight(make):
-    folded = np.column_stack([0.005 * np.tanh((ALONG - 0.3) / 0.01), 0 * ALONG, -np.abs(ALONG - 0.3)])
-    most, places = loads_of(make(table=False), moved(folded, (15, (0, 0, 0))), flexibility=1e-6)
-    assert most[TENSION] == pytest.approx(MASS * GRAVITY / 2, rel=0.03)
-    assert places[TENSION] == pytest.approx(LENGTH / 2, abs=0.01)
+    folded = np.column_stack([0.01 * np.tanh((ALONG - 0.3) / 0.01), 0 * ALONG, -np.abs(ALONG - 0.3)])
+    goals = [Goal(Chain(folded), time, False, ('hand 0',)) for time in (4.0, 5.0)]
+    trial = moved(folded, (15, (0, 0, 0)), times=(0.0, 5.0), goals=goals)
+    physical = {**ROPE, 'flexibility': 1e-6, 'damping': 10.0, 'self_collision': 5e-4}
+    loads = make(table=False).simulate(trial, physical).loads
+    np.testing.assert_allclose(loads.most[-1, TENSION], MASS * GRAVITY / 2, rtol=0.02)
+    np.testing.assert_allclose(loads.places[-1, TENSION], LENGTH / 2, atol=5e-3)
 
 
 def test_a_heavier_end_is_borne_too(make):
@@ -175,6 +179,31 @@ def test_a_clamp_bends_the_rod_where_it_leaves_the_clamp(make):
                             internal_damping=0.1)
     assert most[CURVATURE] == pytest.approx(MASS / LENGTH * GRAVITY * free**2 / 2 / stiffness, rel=0.1)
     assert places[CURVATURE] == pytest.approx(0.02)
+
+
+@pytest.mark.parametrize('angle', [np.pi / 2, np.pi])
+def test_around_a_peg_the_tension_grows_as_the_capstan_equation_says(angle):
+    """A hand slowly pulls a light rope over a cylinder; a weight hangs from its other end."""
+    weight, radius, friction, leg = 0.1, 0.03, 0.2, 0.15
+    turn, count = radius + ROPE['self_collision'], 61
+    along = np.linspace(0, 2 * leg + angle * turn, count)
+    arc = np.clip((along - leg) / turn, 0, angle)
+    points = turn * np.column_stack([-np.cos(arc), 0 * arc, np.sin(arc)])
+    points[:, 2] -= np.maximum(leg - along, 0)
+    way = np.array([np.sin(angle), 0, np.cos(angle)])
+    points += np.maximum(along - leg - angle * turn, 0)[:, None] * way
+    hand = Hand('hand', (count - 1,), [0.0, 2.0], [points[-1], points[-1] + 0.06 * way])
+    goals = [Goal(Chain(points), time, False, ('hand',)) for time in (1.0, 1.9)]
+    chain = Chain(points, features=np.arange(count) == 0)
+    trial = Trial('pulled', chain, (Action((hand,)),), goals, loads=True)
+    along_y = np.array([0.5**0.5, 0, 0, 0.5**0.5])
+    peg = Obstacle('cylinder', np.array([2.0, radius]), np.zeros(3), along_y, 1.0, NO_TRIANGLES)
+    simulator = CompiledSimulator(nodes=count, table=False, obstacles=[peg])
+    loads = simulator.simulate(trial, {**ROPE, 'flexibility': 1e-6, 'elasticity': 2000.0, 'mass': 1e-3,
+                                       'friction': friction, 'marker_mass': weight, 'damping': 1e-3}).loads
+    expected = weight * GRAVITY * np.exp(friction * angle)
+    assert loads.most[-1, TENSION] == pytest.approx(expected, rel=0.03)
+    assert loads.places[-1, TENSION] > leg + angle * turn - 0.06  # beyond the peg
 
 
 def test_what_a_goal_shows_is_since_the_goal_before(make):

@@ -2,9 +2,12 @@
 // SPDX-License-Identifier: Apache-2.0
 // The loads that a DLO bears on its way: the sharpest bend, the largest tension and the largest strain.
 //
-// The curvature at a node is the change of the unit tangent per length that bends there.  The tension of a
-// segment is that of `find_tensions`; a hand that holds a node bears it, and the weight of the half segment
-// between them.  The strain is the tension of a segment divided by EA.
+// The curvature at a node is the change of the unit tangent per length that bends there.  The tension is that
+// of the spring of a segment, see `find_tensions`, and the share of the bending forces along it: the energy of a
+// joint, w / 2 |b|^2 with the bend b, is that of tangents divided by the rest length, so that it also resists
+// stretching, with w |b|^2 / (2 l).  In a bend of radius r, this is EI / r^2, by which the springs are shorter
+// where nothing pulls.  A hand that holds a node bears the tension and the weight of the half segment between
+// them.  The strain is the tension of a segment divided by EA.
 //
 // Hands of a script change their speed within one step, which no hand can: the shock is up to
 // v sqrt(EA m / L).  So tensions are smoothed over `kSlow` until the hands have been steady that long, as if
@@ -26,7 +29,8 @@ class LoadMeter {
   void measure(Rods<Number>& rods, int lane, const Rope& rope) {
     const Rods<double>& properties = rope.rods;
     const int segments = properties.nodes - 1;
-    tensions_.resize(segments, 0.0), tangents_.resize(segments), lengths_.resize(segments);
+    springs_.resize(segments, 0.0), tensions_.resize(segments), tangents_.resize(segments);
+    lengths_.resize(segments);
     hold(rope, properties.step);
     const double time = steady_ < kSlow ? kSlow : kFast, gain = properties.step / (time + properties.step);
     now_ = {};
@@ -36,15 +40,22 @@ class LoadMeter {
       tangents_[i] = 1.0 / length * segment;
       lengths_[i] = is_rigid(i) ? 0.0 : length;
       // Where a hand holds both ends, it bears the forces.
-      tensions_[i] = is_rigid(i) ? 0.0 : tensions_[i] + gain * (in_lane(rods.tensions[i], lane) - tensions_[i]);
-      raise(now_.strain, tensions_[i] / (properties.stiffness[i] * properties.rest_lengths[i]), i + 0.5);
-      raise(now_.tension, tensions_[i], i + 0.5);
+      springs_[i] = is_rigid(i) ? 0.0 : springs_[i] + gain * (in_lane(rods.tensions[i], lane) - springs_[i]);
+      tensions_[i] = springs_[i];
     }
+    const auto& rests = properties.rest_lengths;
     for (int i = 0; i + 1 < segments; ++i) {
       const Point bend = tangents_[i + 1] - tangents_[i];
-      const double length = (lengths_[i] + lengths_[i + 1]) / 2;
-      if (length > 0.0) raise(now_.curvature, sqrt(dot(bend, bend)) / length, i + 1.0);
+      const double square = dot(bend, bend), length = (lengths_[i] + lengths_[i + 1]) / 2;
+      if (length > 0.0) raise(now_.curvature, sqrt(square) / length, i + 1.0);
+      const double torque = properties.bending[i][2] * rests[i] * rests[i + 1] * square / 2;
+      tensions_[i] += torque / rests[i], tensions_[i + 1] += torque / rests[i + 1];
     }
+    for (int i = 0; i < segments; ++i)
+      if (!is_rigid(i)) {
+        raise(now_.strain, tensions_[i] / (properties.stiffness[i] * rests[i]), i + 0.5);
+        raise(now_.tension, tensions_[i], i + 0.5);
+      }
     for (int node : held_) {
       if (node > 0 && !is_rigid(node - 1)) bear(properties, node, node - 1, -1.0);
       if (node < segments && !is_rigid(node)) bear(properties, node, node, 1.0);
@@ -92,7 +103,7 @@ class LoadMeter {
     for (int node : held_) is_held_[node] = true;
   }
 
-  std::vector<double> tensions_, lengths_;  // of the segments: smoothed [N]; that bend [m]
+  std::vector<double> springs_, tensions_, lengths_;  // of the segments: smoothed [N]; [N]; that bend [m]
   std::vector<Point> tangents_;
   std::vector<int> held_;
   std::vector<char> is_held_;
