@@ -232,8 +232,8 @@ class CalibrationResult:
         uncertainty = uncertainty.within(np.minimum(uncertainty.lower, point),
                                          np.maximum(uncertainty.upper, point))
         estimates = {name: wider for name, wider in parameter_estimates(
-            self.space, self.best, uncertainty).items() if wider.std > self.estimates[name].std
-            or (wider.lower, wider.upper) != (self.estimates[name].lower, self.estimates[name].upper)}
+            self.space, self.best, uncertainty).items() if
+            (wider.lower, wider.upper) != (self.estimates[name].lower, self.estimates[name].upper)}
         return replace(self, examination=replace(self.examination, uncertainty=uncertainty),
                        estimates={**self.estimates, **estimates})
 
