@@ -11,6 +11,10 @@ annotated grips. Photographs are chains at rest of four actions, from the folder
 annotated grips. A finer simulation with the true properties makes the stream, and what replaces a photograph.
 The table is printed, and written to benchmark/results/mistakes.md.
 
+A parameter counts as moved if its interval does not hold the truth, or if its value is off by more than a tenth,
+and if the same session without the mistake, with the same noise, does not do so: noise alone is no mistake. An
+interval that is wider than a tenth and holds the truth tells the user so; such runs are counted by themselves.
+
     python benchmark/mistakes.py --sessions DIR
 
 writes the stream of the first DLO instead, with each mistake and none, as sessions for `dlo-calibration fit`.
