@@ -200,12 +200,12 @@ def scattered(fit: Linearisation, uncertainty: Uncertainty, elsewhere: Sequence[
     Widen intervals where other noise of an initial chain leads a trial elsewhere, as in chaos.
 
     There, no linear model shows how far the optimum moves.  So each certain parameter is changed by itself,
-    and the root mean square distance to where it fits best is the least of its standard deviation: a move of
-    one parameter alone is no larger than its move together with the others.
+    to where it fits best.  By how much the mean square of these moves exceeds that in the linear model is
+    added to the variance.
 
     :param elsewhere: of the draws that lead elsewhere, the residuals (m,) [m] at the minimum, and what
         simulates others.
-    :param drawn: number of all draws; those that do not lead elsewhere count as unmoved.
+    :param drawn: number of all draws; those that do not lead elsewhere count as linear.
     :return: also the number of parameter sets that were simulated.
     """
     certain = np.flatnonzero(uncertainty.excited & (uncertainty.std < SUSPECT))
@@ -215,15 +215,19 @@ def scattered(fit: Linearisation, uncertainty: Uncertainty, elsewhere: Sequence[
     points = np.tile(point, (len(certain), len(ELSEWHERE), 1))
     for row, k in zip(points, certain.tolist(), strict=True):
         row[:, k] = np.clip(point[k] + np.array(ELSEWHERE) * uncertainty.std[k], 0.0, 1.0)
-    squares = np.zeros(len(point))
+    excess = np.zeros(len(point))
     for residuals, restart in elsewhere:
-        costs = np.array([loss.cost(there) for there in restart(points.reshape(-1, len(point)))])
-        for row, k, cost in zip(points, certain.tolist(), costs.reshape(len(certain), -1), strict=True):
-            if cost.min() < loss.cost(residuals):
-                squares[k] += (row[cost.argmin(), k] - point[k])**2 / drawn
-    least = DEVIATIONS * np.sqrt(squares)
-    wider = uncertainty.within(np.minimum(uncertainty.lower, np.clip(point - least, 0.0, 1.0)),
-                               np.maximum(uncertainty.upper, np.clip(point + least, 0.0, 1.0)))
+        simulated = restart(points.reshape(-1, len(point)))
+        for n, k in enumerate(certain.tolist()):
+            moves = points[n, :, k] - point[k]
+            linear = [residuals + fit.jacobian[:, k] * move for move in moves]
+            for there, sign in ((simulated[n * len(moves):(n + 1) * len(moves)], 1), (linear, -1)):
+                costs = [loss.cost(residuals), *map(loss.cost, there)]
+                excess[k] += sign * np.append(0.0, moves)[np.argmin(costs)]**2 / drawn
+    std = np.sqrt(uncertainty.std**2 + np.maximum(excess, 0.0))
+    further = DEVIATIONS * (std - uncertainty.std)
+    wider = uncertainty.within(np.maximum(uncertainty.lower - further, 0.0),
+                               np.minimum(uncertainty.upper + further, 1.0))
     return wider, len(elsewhere) * points.shape[0] * points.shape[1]
 
 
