@@ -11,10 +11,6 @@ annotated grips. Photographs are chains at rest of four actions, from the folder
 annotated grips. A finer simulation with the true properties makes the stream, and what replaces a photograph.
 The table is printed, and written to benchmark/results/mistakes.md.
 
-A parameter counts as moved if its interval does not hold the truth, or if its value is off by more than a tenth,
-and if the same session without the mistake, with the same noise, does not do so: noise alone is no mistake. An
-interval that is wider than a tenth and holds the truth tells the user so; such runs are counted by themselves.
-
     python benchmark/mistakes.py --sessions DIR
 
 writes the stream of the first DLO instead, with each mistake and none, as sessions for `dlo-calibration fit`.
@@ -86,6 +82,13 @@ NAMES = {
     'late': r'stamps seem .*(late|early)', 'shifted': r'off in [xyz]',
     'missed': r'missed|did not move', 'slipped': r'slipped|let go', 'reversed': r'other end',
     'table': r'table_height', 'noise': r'noise of'}
+#: What counts as moved.
+COUNTED = """\
+A parameter that is called identifiable counts as moved if its interval does not hold the truth, or if its value
+is off by more than a tenth; and if the same session without the mistake, with the same noise, does not show
+that: what noise alone does is no mistake's doing. Where an interval is wider than a tenth and holds the truth,
+the user is told so; the second line counts the other runs."""
+
 PAIRS = (('late', 'shifted'), ('late', 'missed'), ('shifted', 'slipped'), ('missed', 'noise'),
          ('late', 'table'), ('reversed', 'missed'))
 
@@ -407,7 +410,7 @@ def main() -> None:
                        for name, (t, v, lo, up, verdict) in outcome.values.items()},
                       [word[:150] for word in outcome.words if word], flush=True)
     text = (f'# mistakes\n\n`python benchmark/mistakes.py --seeds {options.seeds}`: {len(outcomes)} runs.\n\n'
-            f'{summary(outcomes)}\n\n{table(outcomes)}\n')
+            f'{summary(outcomes)}\n\n{COUNTED}\n\n{table(outcomes)}\n')
     if not options.only:
         (HERE / 'results' / 'mistakes.md').write_text(text, encoding='utf-8')
     print(text)
