@@ -84,10 +84,10 @@ NAMES = {
     'table': r'table_height', 'noise': r'noise of'}
 #: What counts as moved.
 COUNTED = """\
-A parameter that is called identifiable counts as moved if its interval does not hold the truth, or if its value
-is off by more than a tenth; and if the same session without the mistake, with the same noise, does not show
-that: what noise alone does is no mistake's doing. Where an interval is wider than a tenth and holds the truth,
-the user is told so; the second line counts the other runs."""
+A parameter that is called identifiable counts as moved if its interval does not hold the truth, or if its
+value is off by more than a tenth; and if the same session without the mistake, with the same noise, does not
+show that: what noise alone does is no mistake's doing. Where an interval is wider than a tenth and holds the
+truth, the user is told so; the second line counts the other runs."""
 
 PAIRS = (('late', 'shifted'), ('late', 'missed'), ('shifted', 'slipped'), ('missed', 'noise'),
          ('late', 'table'), ('reversed', 'missed'))
