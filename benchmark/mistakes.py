@@ -27,7 +27,7 @@ import multiprocessing
 from pathlib import Path
 import re
 import sys
-from typing import Iterator, Sequence
+from typing import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -82,6 +82,13 @@ NAMES = {
     'late': r'stamps seem .*(late|early)', 'shifted': r'off in [xyz]',
     'missed': r'missed|did not move', 'slipped': r'slipped|let go', 'reversed': r'other end',
     'table': r'table_height', 'noise': r'noise of'}
+#: What counts as moved.
+COUNTED = """\
+A parameter that is called identifiable counts as moved if its interval does not hold the truth, or if its
+value is off by more than a tenth; and if the same session without the mistake, with the same noise, does not
+show that: what noise alone does is no mistake's doing. Where an interval is wider than a tenth and holds the
+truth, the user is told so; the second line counts the other runs."""
+
 PAIRS = (('late', 'shifted'), ('late', 'missed'), ('shifted', 'slipped'), ('missed', 'noise'),
          ('late', 'table'), ('reversed', 'missed'))
 
@@ -115,23 +122,35 @@ class Outcome:
         """The mistakes that the words name."""
         return {name for name, pattern in NAMES.items() if re.search(pattern, ' '.join(self.words))}
 
-    @property
-    def moved(self) -> bool:
-        """Whether a parameter called identifiable has left its interval, or its value a tenth."""
-        return any(verdict == 'identifiable' and (
-            not lower <= truth <= upper or abs(_ratio(name, value, truth) - 1) > 0.1)
-            for name, (truth, value, lower, upper, verdict) in self.values.items())
+    def moved(self, right: Outcome | None = None) -> list[str]:
+        """
+        Return which parameters called identifiable have left their intervals, or are off by a tenth.
+
+        :param right: the same session without the mistakes: what noise alone does there is not counted.
+        """
+        return [name for name, estimate in self.values.items() if estimate[-1] == 'identifiable' and (
+            not self.holds(name) and not (right is not None and right._is_wrong_interval(name))
+            or self._is_off(name, estimate[0]) and not (
+                right is not None and name in right.values and right.values[name][-1] == 'identifiable'
+                and not self._is_off(name, right.values[name][1])))]
+
+    def holds(self, name: str) -> bool:
+        """Whether the interval of a parameter holds the truth."""
+        truth, _, lower, upper, _ = self.values[name]
+        return lower <= truth <= upper
+
+    def _is_wrong_interval(self, name: str) -> bool:
+        return name in self.values and self.values[name][-1] == 'identifiable' and not self.holds(name)
+
+    def _is_off(self, name: str, other: float) -> bool:
+        """Whether the physical value differs from another one, on the 0..100 scale, by more than a tenth."""
+        physical = BY_NAME[name].physical
+        return abs(physical(self.values[name][1]) / physical(other) - 1) > 0.1
 
     @property
     def inside(self) -> list[bool]:
         """Whether each interval of a parameter called identifiable holds the truth."""
-        return [lower <= truth <= upper for truth, _, lower, upper, verdict in self.values.values()
-                if verdict == 'identifiable']
-
-
-def _ratio(name: str, value: float, truth: float) -> float:
-    physical = BY_NAME[name].physical
-    return physical(value) / physical(truth)
+        return [self.holds(name) for name, estimate in self.values.items() if estimate[-1] == 'identifiable']
 
 
 @cache
@@ -296,7 +315,7 @@ def cases(seeds: int, only: Sequence[str] = ()) -> Iterator[Case]:
 
 def table(outcomes: Sequence[Outcome]) -> str:
     """Return the table of the outcomes."""
-    groups = defaultdict(list)
+    groups, right = defaultdict(list), without_mistake(outcomes)
     for outcome in outcomes:
         names = ' and '.join(name for name, _ in outcome.case.mistakes) or 'none'
         groups[names, 'stream' if outcome.case.stream else 'photographs'].append(outcome)
@@ -311,16 +330,25 @@ def table(outcomes: Sequence[Outcome]) -> str:
             f'| {names} | {observed} | {len(group)} | {len(usable)} '
             f'| {sum(made <= o.named for o in group) if made else "-"} '
             f'| {sum(bool(o.named - made) for o in group)} '
-            f'| {sum(o.moved and not o.named & made for o in usable)} '
+            f'| {sum(bool(o.moved(right(o))) and not o.named & made for o in usable)} '
             f'| {sum(held)} of {len(held)} |')
     return '\n'.join(rows)
 
 
+def without_mistake(outcomes: Sequence[Outcome]) -> Callable[[Outcome], Outcome | None]:
+    """Return what finds the outcome of the same session without its mistakes; None for one without any."""
+    right = {(o.case.dlo.name, o.case.stream, o.case.seed): o for o in outcomes if not o.case.mistakes}
+    return lambda o: right.get((o.case.dlo.name, o.case.stream, o.case.seed)) if o.case.mistakes else None
+
+
 def summary(outcomes: Sequence[Outcome]) -> str:
-    """Return the four figures that count."""
+    """Return the figures that count, and the runs that no word was said about."""
+    before = without_mistake(outcomes)
     wrong = [o for o in outcomes if o.case.mistakes]
     right = [o for o in outcomes if not o.case.mistakes]
-    silent = [o for o in wrong if o.usable and o.moved and not o.named]
+    silent = [o for o in wrong if o.usable and o.moved(before(o)) and not o.named]
+    outside = [o for o in silent if not all(o.holds(name) for name in o.moved(before(o)))]
+    by_noise = [o for o in right if o.usable and o.moved()]
     single = [o for o in wrong if len(o.case.mistakes) == 1]
     named = [o for o in single if {name for name, _ in o.case.mistakes} <= o.named]
     warned = [o for o in right if o.named or not o.usable]
@@ -328,11 +356,19 @@ def summary(outcomes: Sequence[Outcome]) -> str:
     share = [f'| {words} | {part} of {count} | {100 * part / max(count, 1):.1f} % |'
              for words, part, count in (
         ('runs with a mistake, usable without a word, but a parameter moved', len(silent), len(wrong)),
+        ('of these, those whose interval does not hold the truth either', len(outside), len(silent)),
         ('the mistake named rightly, of runs with one mistake', len(named), len(single)),
         ('runs without a mistake that are warned of', len(warned), len(right)),
+        ('runs without a mistake, usable, but noise moved a parameter as much', len(by_noise), len(right)),
         ('90 % intervals of identifiable parameters in usable runs that hold the truth', sum(held),
          len(held)))]
-    return '\n'.join(['| figure | runs | share |', '|---|---|---|', *share])
+    told = [f'- {o.case.dlo.name}, {"stream" if o.case.stream else "photographs"}, '
+            f'{" and ".join(f"{name} {size}" for name, size in o.case.mistakes)}, seed {o.case.seed}: '
+            + '; '.join(f'{name} {value:.1f} [{lower:.1f}, {upper:.1f}], truth {truth:.1f}' for name in
+                        o.moved(before(o)) for truth, value, lower, upper, _ in [o.values[name]])
+            for o in silent]
+    return '\n'.join(['| figure | runs | share |', '|---|---|---|', *share,
+                      *['', 'Moved without a word, on the scale from 0 to 100:', '', *told] * bool(told)])
 
 
 def write_sessions(folder: Path) -> None:
@@ -369,12 +405,12 @@ def main() -> None:
                 case = outcome.case
                 print(case.dlo.name, 'stream' if case.stream else 'photos', case.mistakes, case.seed,
                       'usable' if outcome.usable else 'UNUSABLE', f'{1e3 * outcome.error:.1f} mm',
-                      sorted(outcome.named), 'MOVED' if outcome.moved else '',
+                      sorted(outcome.named), 'MOVED' if outcome.moved() else '',
                       {name: f'{t:.1f}: {v:.1f} [{lo:.1f}, {up:.1f}] {verdict[:6]}'
                        for name, (t, v, lo, up, verdict) in outcome.values.items()},
                       [word[:150] for word in outcome.words if word], flush=True)
     text = (f'# mistakes\n\n`python benchmark/mistakes.py --seeds {options.seeds}`: {len(outcomes)} runs.\n\n'
-            f'{summary(outcomes)}\n\n{table(outcomes)}\n')
+            f'{summary(outcomes)}\n\n{COUNTED}\n\n{table(outcomes)}\n')
     if not options.only:
         (HERE / 'results' / 'mistakes.md').write_text(text, encoding='utf-8')
     print(text)

@@ -133,10 +133,10 @@ class CalibrationResult:
         Why the parameters should not be used, in one sentence; '' if they can be.
 
         The first of these reasons counts: a trial is implausible; stamps or places of the hands are wrong;
-        the fit is far worse than models of DLOs are; a trial that does not fit the others decides a value;
-        two engines differ by more than the fit misses the measurement; the search ended before a minimum;
-        the fit is not better than the default parameters, though noise does not explain it; the trials
-        determine no parameter.
+        the fit is far worse than models of DLOs are; a trial that does not fit the others decides a value,
+        unless it is sensitive; two engines differ by more than the fit misses the measurement; the search
+        ended before a minimum; the fit is not better than the default parameters, though noise does not
+        explain it; the trials determine no parameter.
         """
         mean, examination, other = self.errors.mean, self.examination, self.confirmation
         if self.implausible:
@@ -148,7 +148,7 @@ class CalibrationResult:
                     'grips and clocks')
         if self.choice is None:
             return self.unusable_fit
-        if self.outlier is not None and self.outlier.decided:
+        if self.outlier is not None and self.outlier.decided and not self.outlier.sensitive:
             return self.outlier_words
         if other is not None and other.mean_distance > max(mean, DISTANCE_TOLERANCE):
             return (f'engine {other.engine} differs from {self.engine} by '
@@ -218,9 +218,24 @@ class CalibrationResult:
                             for name in odd.decided) or 'the same values within their intervals'
         why = 'its goal chains seem to run from the other end of the DLO' if odd.turned else \
             'a hand may have slipped or let go early'
+        if odd.sensitive:
+            why += (f'; or it is only sensitive, as the uncertainty of the parameters moves its points by '
+                    f'{measured(odd.spread, "m")}')
         return (f'{odd.trial} does not fit the others: {measured(odd.error, "m")} from what they predict, '
                 f'where they miss {measured(odd.usual, "m")}; without it: {without}; {why}: repeat it, or '
                 f'leave it out (--without {odd.number})')
+
+    def including(self, point: Floats) -> CalibrationResult:
+        """Return a result whose intervals contain a (d,) point of the unit cube as well."""
+        assert self.examination is not None
+        uncertainty = self.examination.uncertainty
+        uncertainty = uncertainty.within(np.minimum(uncertainty.lower, point),
+                                         np.maximum(uncertainty.upper, point))
+        estimates = {name: wider for name, wider in parameter_estimates(
+            self.space, self.best, uncertainty).items() if
+            (wider.lower, wider.upper) != (self.estimates[name].lower, self.estimates[name].upper)}
+        return replace(self, examination=replace(self.examination, uncertainty=uncertainty),
+                       estimates={**self.estimates, **estimates})
 
     @property
     def trial_errors(self) -> tuple[Floats, ...]:

@@ -30,7 +30,7 @@ from dlo_calibration.evaluation.residuals import compared_rows, Huber, ResidualL
 from dlo_calibration.inference.advice import advise
 from dlo_calibration.inference.examination import Confirmation, disagreements, Examination, examine
 from dlo_calibration.inference.missing_parameters import missing_parameters
-from dlo_calibration.inference.outlier import candidate, is_outlier, Outlier
+from dlo_calibration.inference.outlier import candidate, is_outlier, Outlier, spread_without
 from dlo_calibration.inference.slices import simulate_slices, Slices
 from dlo_calibration.inference.uncertainty import Uncertainty
 from dlo_calibration.model.chain import Floats
@@ -83,12 +83,14 @@ def _examined(setting: Setting, fit: Fit) -> tuple[Examination, Evaluation]:
     try:
         # These begin first: they need no later outcome, and occupy threads that would be idle.
         fine = None if finer is None else setting.evaluate(space, finer=finer).begin(here)
-        starts = [setting.evaluate(space, others).begin(here) for others in drawn]
+        restarts = [setting.evaluate(space, others) for others in drawn]
+        starts = [restart.begin(here) for restart in restarts]
         hands = [setting.evaluate(_with_hand(space, setting, name)).begin(here)
                  for name in setting.choice.corrected]
         examination = examine(
             best.point, best.residuals, ResidualLayout.compared(trials), evaluate.residuals,
             default=default, noise=sigma, finer=fine, starts=starts, hands=hands,
+            restarted=[restart.residuals for restart in restarts],
             fading=np.array([name not in REST_SHAPE for name in space.free]))
     finally:
         if finer is not None:
@@ -150,9 +152,15 @@ def with_outlier(setting: Setting, result: CalibrationResult) -> CalibrationResu
     decided = tuple(name for name, value in values.items() if result.estimates[name].identifiable
                     and not result.estimates[name].lower <= value <= result.estimates[name].upper)
     apart = np.linalg.norm(simulated_chains(trials, evaluation)[k] - observed(trials[k])[:, ::-1], axis=2)
-    return replace(result, outlier=Outlier(
+    assert without.residuals is not None
+    outlier = Outlier(
         trials[k].name, k + 1, float(errors[k]), float(np.delete(errors, k).mean()), values,
-        turned=bool(np.nanmean(apart) < 0.5 * errors[k]), decided=decided))
+        turned=bool(np.nanmean(apart) < 0.5 * errors[k]), decided=decided,
+        spread=spread_without(k, ResidualLayout.compared(trials), without.point, without.residuals,
+                              result.examination.jacobian, result.examination.noise))
+    if outlier.sensitive and result.examination.regular:
+        result = result.including(without.point)
+    return replace(result, outlier=outlier)
 
 
 def advised(setting: Setting, result: CalibrationResult) -> CalibrationResult:

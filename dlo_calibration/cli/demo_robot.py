@@ -17,7 +17,6 @@ import time
 from typing import Any, Callable, Iterator
 
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.cli.validate import validated
 from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.files.result import HOW, read_result
 from dlo_calibration.files.session import read_session, Session, session_trials
@@ -25,6 +24,7 @@ from dlo_calibration.messages.codec import INPUT_TYPES, OUTPUT_TYPES, rclpy_type
 from dlo_calibration.report import terminal
 from dlo_calibration.report.drawing import session_picture
 from dlo_calibration.workspace.folder import RESULT
+from dlo_calibration.workspace.validation import validated
 from dlo_calibration.writing import make_folder
 
 NODE = '/calibrator'  # its full name, the namespace of its topics

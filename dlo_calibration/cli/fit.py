@@ -17,12 +17,12 @@ from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.result import plain
 from dlo_calibration.cli.arguments import add_source, selected
 from dlo_calibration.cli.output import print_json, print_message, print_result
-from dlo_calibration.cli.validate import validated
 from dlo_calibration.errors import InputError, SimulationError
 from dlo_calibration.files.result import HOW, read_result
 from dlo_calibration.signals import StopFlag
 from dlo_calibration.workspace.folder import CalibrationFolder, EVALUATIONS, FILES, REPORT, RESULT, SESSION
 from dlo_calibration.workspace.source import read_source, Source
+from dlo_calibration.workspace.validation import validated
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -12,9 +12,9 @@ from pathlib import Path
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.cli.arguments import add_source, read_result_file, selected
 from dlo_calibration.cli.output import print_json, print_message
-from dlo_calibration.cli.validate import validated
 from dlo_calibration.errors import InputError
 from dlo_calibration.workspace.source import read_source
+from dlo_calibration.workspace.validation import validated
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -6,32 +6,14 @@
 from __future__ import annotations
 
 import argparse
-from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
-import time
-from typing import Sequence
 
-from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.calibration.engines import SimulatorFactory
-from dlo_calibration.calibration.options import Options
-from dlo_calibration.calibration.result import CalibrationResult, simulated_chains
 from dlo_calibration.calibration.stages import confirmed
 from dlo_calibration.cli.arguments import add_source, read_result_file, selected
 from dlo_calibration.cli.output import print_message, print_result
-from dlo_calibration.errors import SimulationError
-from dlo_calibration.evaluation.evaluation import Evaluator
-from dlo_calibration.files.result import Description
-from dlo_calibration.model.parameters import BY_NAME, measured, number, ParameterSpace
-from dlo_calibration.model.trial import Trial
-from dlo_calibration.observation.grips import GripEvidence
-from dlo_calibration.observation.material import with_shared_places
-from dlo_calibration.observation.plausibility import implausible_trials
 from dlo_calibration.workspace.source import read_source
-
-# Unseen actions of the reference objects have up to 1.7 times the error of the calibration (intervals.md in
-# benchmark/results); a DLO of which points move by less than 0.5 % of the length behaves the same.
-FURTHER, SAME = 5.0, 0.005
+from dlo_calibration.workspace.validation import validated
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,56 +30,3 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     result = validated(file, source.trials, source.options, make_simulator)
     print_result(confirmed(result, source.options, make_simulator), chosen.json, source.trial_warnings)
     return 0
-
-
-def validated(file: Description, trials: Sequence[Trial], options: Options,
-              make_simulator: SimulatorFactory = make_chosen_simulator) -> CalibrationResult:
-    """
-    Simulate trials with the parameters of a result, without fitting.
-
-    :returns: a result whose only evaluation has these parameters; values and intervals are those of `file`.
-    :raises InputError: if the hands have lost the DLO in all trials.
-    :raises SimulationError: if a trial cannot be simulated.
-    """
-    evidence = GripEvidence.of(trials)
-    trials = with_shared_places(evidence.require_usable(trials))
-    space, hands = _with_errors(evidence, file)
-    with closing(make_simulator(options)) as simulator:
-        begun = time.monotonic()
-        evaluation = Evaluator(trials, space, simulator).evaluate(0, space.point(file.values))
-        seconds = time.monotonic() - begun
-    if evaluation.failure:
-        raise SimulationError(evaluation.failure)
-    implausible = implausible_trials(trials, options.table_top, bool(options.scene))
-    warnings = (*implausible, *hands, *(f'never came to rest: {name}; the last state was compared'
-                                        for name in evaluation.unsettled))
-    result = CalibrationResult(
-        space=space, estimates={name: file.parameters[name] for name in space.free}, best=evaluation,
-        trials=trials, chains=simulated_chains(trials, evaluation), evaluations=(evaluation,),
-        seconds=seconds, search=file.search, engine=simulator.name,
-        stop_reason='validation: nothing was fitted', seed=file.seed, warnings=warnings,
-        implausible=implausible, unusable_fit=file.unusable)
-    mean, of_fit = result.errors.mean, file.errors.mean
-    if not result.unusable and mean > max(FURTHER * of_fit, SAME * result.length):
-        result = replace(result, unusable_fit=(
-            f'the mean error is {number(mean / of_fit)} times that of the calibration, '
-            f'{measured(of_fit, "m")}; check whether this is the same DLO, in the same frame'))
-    return result
-
-
-def _with_errors(evidence: GripEvidence, file: Description) -> tuple[ParameterSpace, tuple[str, ...]]:
-    """
-    Return the space of a result, with the errors that the hands have in other trials, and a warning for each.
-
-    Late clocks and shifted hands are no property of the DLO: another session may have others.
-    """
-    space, physical = file.space, file.physical()
-    errors = evidence.other_than(physical)
-    free = tuple(name for name in space.free if name not in errors)
-    if not free or not errors:
-        return space, ()
-    fixed = {**space.fixed, **{name: BY_NAME[name].value(value) for name, value in errors.items()}}
-    return replace(space, free=free, fixed=fixed), tuple(
-        f'{name}: {measured(value, BY_NAME[name].unit)} in this session, '
-        f'{measured(physical.get(name, 0.0), BY_NAME[name].unit)} in the result; that of the session is used'
-        for name, value in errors.items())

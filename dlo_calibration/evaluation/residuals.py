@@ -82,6 +82,10 @@ class ResidualLayout:
                                in zip(self.shapes, unseen, strict=True))]).tolist()
         return [slice(begin, end) for begin, end in zip(ends[:-1], ends[1:], strict=True)]
 
+    def without(self, k: int) -> ResidualLayout:
+        """Return the layout of the residuals of all trials but the one with the index k."""
+        return ResidualLayout(self.shapes[:k] + self.shapes[k + 1:], self.unseen[:k] + self.unseen[k + 1:])
+
     def folds(self, most: int) -> list[slice]:
         """Return the rows of at most `most` folds of a cross-validation, each of neighbouring trials."""
         rows = self.rows

@@ -5,9 +5,9 @@
 Examination: simulations around the found parameters, after a search has ended.
 
 It simulates each parameter changed in both directions; finer nodes and steps; initial chains with other
-noise; the default parameters; for each trial, a step towards the optimum of the others; and the ends of wide
-intervals.  The module `uncertainty` computes the intervals from these.  A confirmation compares the engine
-with a second one.
+noise; the default parameters; for each trial, a step towards the optimum of the others; the ends of wide
+intervals; and certain parameters changed where other noise leads a trial elsewhere.  The module `uncertainty`
+computes the intervals from these.  A confirmation compares the engine with a second one.
 """
 
 from __future__ import annotations
@@ -42,6 +42,8 @@ Pending = Callable[[], Sequence[Floats | None]]
 SUSPECT = 0.01
 #: A step of so many standard deviations shows what happens there, if it is not shorter than SHORTEST.
 NEARBY, SHORTEST = 4.0, 0.003
+#: Standard deviations by which a certain parameter is changed where other noise leads a trial elsewhere.
+ELSEWHERE = (-6.0, -3.0, -1.5, 1.5, 3.0, 6.0)
 
 
 @dataclass(frozen=True)
@@ -75,8 +77,8 @@ class Examination:
 
 def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: Evaluate, *,
             default: Floats, noise: float, finer: Pending | None = None,
-            starts: Sequence[Pending] = (), hands: Sequence[Pending] = (),
-            fading: NDArray[np.bool_] | None = None) -> Examination:
+            starts: Sequence[Pending] = (), restarted: Sequence[Evaluate] = (),
+            hands: Sequence[Pending] = (), fading: NDArray[np.bool_] | None = None) -> Examination:
     """
     Examine the (d,) `point` of the unit cube, where the residuals are `residuals` (m,) [m].
 
@@ -85,6 +87,7 @@ def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: 
     :param noise: noise level, see `Examination` [m].
     :param finer: returns the residuals at `point` with more nodes and a smaller step; None: not simulated.
     :param starts: each returns those with initial chains of other noise; may be empty.
+    :param restarted: each simulates the trials with the initial chains of one of `starts`; may be empty.
     :param hands: each returns those with an error of the hands that is larger by its standard deviation.
     :param fading: (d,) False for parameters whose effect is much the same along their scale; None: all may
         fade or have kinks.
@@ -113,6 +116,10 @@ def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: 
                              starts=[residuals for residuals in drawn if residuals is not None],
                              hands=[residuals for residuals in others if residuals is not None])
     uncertainty = extended(fit, uncertainty, residuals_at, fading)
+    elsewhere = [(there, restart) for there, restart in zip(drawn, restarted, strict=False)
+                 if there is not None and np.sqrt(np.mean((there - residuals)**2)) > uncertainty.residual]
+    uncertainty, simulated = scattered(fit, uncertainty, elsewhere, len(drawn))
+    count += simulated
     return Examination(
         uncertainty=uncertainty, jacobian=frozen_array(fit.jacobian), noise=noise,
         regular=_converged(fit, uncertainty),
@@ -185,6 +192,43 @@ def extended(fit: Linearisation, uncertainty: Uncertainty, residuals_at: Evaluat
     for side, k in unsure:
         ends[side, k] = limits[side]
     return uncertainty.within(ends[0], ends[1])
+
+
+def scattered(fit: Linearisation, uncertainty: Uncertainty, elsewhere: Sequence[tuple[Floats, Evaluate]],
+              drawn: int) -> tuple[Uncertainty, int]:
+    """
+    Widen intervals where other noise of an initial chain leads a trial elsewhere, as in chaos.
+
+    There, no linear model shows how far the optimum moves.  So each certain parameter is changed by itself,
+    to where it fits best.  By how much the mean square of these moves exceeds that in the linear model is
+    added to the variance.
+
+    :param elsewhere: of the draws that lead elsewhere, the residuals (m,) [m] at the minimum, and what
+        simulates others.
+    :param drawn: number of all draws; those that do not lead elsewhere count as linear.
+    :return: also the number of parameter sets that were simulated.
+    """
+    certain = np.flatnonzero(uncertainty.excited & (uncertainty.std < SUSPECT))
+    if not elsewhere or not len(certain):
+        return uncertainty, 0
+    loss, point = Huber.of(fit.residuals), fit.point
+    points = np.tile(point, (len(certain), len(ELSEWHERE), 1))
+    for row, k in zip(points, certain.tolist(), strict=True):
+        row[:, k] = np.clip(point[k] + np.array(ELSEWHERE) * uncertainty.std[k], 0.0, 1.0)
+    excess = np.zeros(len(point))
+    for residuals, restart in elsewhere:
+        simulated = restart(points.reshape(-1, len(point)))
+        for n, k in enumerate(certain.tolist()):
+            moves = points[n, :, k] - point[k]
+            linear = [residuals + fit.jacobian[:, k] * move for move in moves]
+            for there, sign in ((simulated[n * len(moves):(n + 1) * len(moves)], 1), (linear, -1)):
+                costs = [loss.cost(residuals), *map(loss.cost, there)]
+                excess[k] += sign * np.append(0.0, moves)[np.argmin(costs)]**2 / drawn
+    std = np.sqrt(uncertainty.std**2 + np.maximum(excess, 0.0))
+    further = DEVIATIONS * (std - uncertainty.std)
+    wider = uncertainty.within(np.maximum(uncertainty.lower - further, 0.0),
+                               np.minimum(uncertainty.upper + further, 1.0))
+    return wider, len(elsewhere) * points.shape[0] * points.shape[1]
 
 
 def _converged(fit: Linearisation, uncertainty: Uncertainty) -> bool:

@@ -15,7 +15,6 @@ import pytest
 from dlo_calibration import calibrate, Chain, InputError, Options
 from dlo_calibration.calibration.engines import make_simulator
 from dlo_calibration.cli.arguments import add_options, given_options
-from dlo_calibration.cli.validate import validated
 from dlo_calibration.files.request import (
     GoalRequest,
     read_request,
@@ -29,6 +28,7 @@ from dlo_calibration.messages.codec import GOAL
 from dlo_calibration.messages.collector import TrialCollector
 from dlo_calibration.messages.encoder import trial_messages
 from dlo_calibration.model.parameters import HANDS
+from dlo_calibration.workspace.validation import validated
 from dlo_calibration.workspace.worker import Failure, Worker
 
 PHYSICS = ('flexibility', 'friction')

@@ -169,6 +169,36 @@ def test_other_noise_of_the_initial_chains_is_simulated_and_widens_what_it_moves
     assert examination.uncertainty.std[1] < 1.5 * plain.uncertainty.std[1]
 
 
+class Elsewhere(Model):
+    """Points jump aside, which no parameter does, unless the first parameter is at least `valley`."""
+
+    def __init__(self, jacobian, errors, valley):
+        super().__init__(jacobian, errors)
+        aside = np.random.default_rng(5).normal(size=ROWS)
+        self.valley = valley
+        self.jump = 5 * NOISE * (aside - jacobian @ np.linalg.lstsq(jacobian, aside, rcond=None)[0])
+
+    def at(self, point):
+        return super().at(point) + self.jump * (point[0] < self.valley)
+
+
+def test_where_other_noise_leads_trials_elsewhere_the_optimum_is_looked_for():
+    model = noisy_model()
+    point, plain = optimum(model), examined(model)
+    move = 2.5 * plain.uncertainty.std[0]
+    draws = [Elsewhere(model.jacobian, model.errors, point[0] + move) for _ in range(2)]
+    quiet = [Model(model.jacobian, model.errors) for _ in range(2)]
+    linear_only = examined(model, starts=[*draws, *quiet])
+    assert linear_only.uncertainty.std[0] < 1.2 * plain.uncertainty.std[0]
+    examination = examined(model, starts=[*draws, *quiet], restarted=[*draws, *quiet])
+    assert [len(model.asked) > 2 for model in (*draws, *quiet)] == [True, True, False, False]
+    assert examination.evaluations == linear_only.evaluations + sum(len(model.asked) - 2 for model in draws)
+    expected = move / np.sqrt(2)  # two of four draws
+    assert expected <= examination.uncertainty.std[0] <= 1.5 * expected
+    assert examination.uncertainty.std[1] < 1.2 * linear_only.uncertainty.std[1]
+    assert examination.uncertainty.lower[0] < point[0] - 1.6 * expected
+
+
 class Fading(Model):
     """The effect of the first parameter is exponential: like a strain, which fades as the stiffness grows."""
 
