@@ -89,6 +89,7 @@ struct Strands {
 };
 
 /// The plastic part of the bend at an inner node: the bend at which friction between strands has no stress.
+/// Where strands turn with the material frame, `bend` and `strain` are components in it, with z = 0.
 template <class Number>
 struct PlasticBend {
   Vec3<Number> bend;
@@ -101,6 +102,13 @@ template <class Number>
 struct StrandForce {
   Bending<Number> matrix;  // [kg]
   Vec3<Number> impulse;    // [N s], against the bend
+};
+
+/// What bends the DLO at an inner node beside its elasticity, in the material frame, and resists a bend there.
+template <class Number>
+struct Moment {
+  Number x, y;       // [N m]
+  Number stiffness;  // [N m] beside that of the elasticity
 };
 
 /// One DLO of `nodes` nodes, or four like it.
@@ -140,6 +148,7 @@ struct Rods {
   std::vector<Vec3<Number>> tangents, across;
   std::vector<Number> inverse_lengths, clamped, prescribed, turning, upper;
   std::vector<StrandForce<Number>> strand_forces;
+  std::vector<Moment<Number>> moments;
   Number solved;                       // 1 where the last step was finite
   std::array<Number, 2> last_moves{};  // in the last step, see `Movement`
   std::array<Number, 2> next_moves;    // in this step, without contact
@@ -159,7 +168,7 @@ struct Rods {
     natural.resize(framed ? inner : 0), twisting.resize(framed ? inner : 0);
     joints.resize(framed ? inner : 0), bishop.resize(framed ? 2 : 0);
     strands.resize(strands_rub ? inner : 0), plastic.resize(strands_rub ? inner : 0);
-    strand_forces.resize(strands_rub ? n : 0);
+    strand_forces.resize(strands_rub ? n : 0), moments.resize(framed && strands_rub ? inner : 0);
   }
 
   /// Whether it can be stepped together with another DLO.
