@@ -2,9 +2,10 @@
 // SPDX-License-Identifier: Apache-2.0
 // Moments in the material frame: natural curvature, and friction between strands.
 //
-// Where a DLO resists twist, its strands turn with its material.  Then the plastic bend of strands.hpp has two
-// components in the material frame, at the mean angle of both segments, in place of a vector that turns by the
-// smallest rotation.  So twist alone makes strands rub, too, and their moment turns the frame.
+// Where a DLO resists twist, its strands turn with its material.  Then the plastic bend of strands.hpp has
+// two components in the material frame, at the mean angle of both segments, in place of a vector that turns
+// by the smallest rotation.  So a bent DLO that turns about its axis rubs, too, and the moment of friction
+// turns the frame.
 
 namespace dlo {
 namespace DLO_TARGET {
@@ -21,8 +22,8 @@ inline std::array<Number, 2> turned(const Number& x, const Number& y, const Join
   return {x * joint.cosine - y * joint.sine, x * joint.sine + y * joint.cosine};
 }
 
-/// Compute `moments`.  `follow`: the plastic bend follows the bend, and strands that are going to slip have their
-/// secant stiffness, see strands.hpp.
+/// Compute `moments`.  `follow`: the plastic bend follows the bend, and strands that are going to slip have
+/// their secant stiffness, see strands.hpp.
 template <class Number>
 inline void find_moments(Rods<Number>& rods, bool begun, bool follow) {
   const int joints = rods.nodes - 2;

@@ -104,11 +104,11 @@ struct StrandForce {
   Vec3<Number> impulse;    // [N s], against the bend
 };
 
-/// What bends the DLO at an inner node beside its elasticity, in the material frame, and resists a bend there.
+/// Natural curvature and friction between strands at an inner node, in the material frame.
 template <class Number>
 struct Moment {
-  Number x, y;       // [N m]
-  Number stiffness;  // [N m] beside that of the elasticity
+  Number x, y;       // what bends the DLO beside its elasticity [N m]
+  Number stiffness;  // of the strands [N m]
 };
 
 /// One DLO of `nodes` nodes, or four like it.
