@@ -163,7 +163,8 @@ def _inside(axes: list[Floats], triangles: Floats, cell: float) -> NDArray[np.bo
                      np.searchsorted(ys, triangles[:, :, 1].max(axis=1))], axis=1)
     wide, deep = (high - low).T
     if (columns := int((wide * deep).sum())) > MOST_CROSSINGS:
-        raise ValueError(f'a mesh whose triangles lie above each other {columns // np.prod(counts[:2])} times')
+        layers = columns // np.prod(counts[:2])
+        raise ValueError(f'a mesh with {layers} triangles above each other')
     for chunk in np.array_split(np.arange(len(triangles)), 1 + columns // 2_000_000):
         number = wide[chunk] * deep[chunk]
         which = np.repeat(chunk, number)

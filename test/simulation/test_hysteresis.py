@@ -16,12 +16,13 @@ from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.simulation.bullet import BulletRope, pybullet
 
 STIFFNESS, FRICTION, SLIP = 1e-3, 2.0, 0.5
+TWISTS = {'torsion': 0.7, 'natural_curvature': 1e-12}  # it has a material frame, to which its strands belong
 
 
-def moments(curvatures, steps=50):
+def moments(curvatures, steps=50, **others):
     """Return the moment [N m] of friction at the middle of three nodes that are bent to each curvature."""
     length = 0.05
-    physical = properties(STIFFNESS, 1e4, 0.01, bending_friction=FRICTION, bending_slip=SLIP)
+    physical = properties(STIFFNESS, 1e4, 0.01, bending_friction=FRICTION, bending_slip=SLIP, **others)
     rod = Rod(np.full(2, length), physical, 1e-9)
     friction_moments, before = [], 0.0
     for curvature in curvatures:
@@ -30,7 +31,10 @@ def moments(curvatures, steps=50):
             end = length * np.array([np.cos(angle), np.sin(angle), 0])
             points = np.array([end * (-1, 1, 1), (0, 0, 0), end])
             rod.velocities(points, np.zeros_like(points), NONE, FREE)
-        friction_moments.append(-rod.state.strand_forces[1, 4] / 1e-9 * length / 2)
+        impulse = -rod.state.strand_forces[1, 4]
+        if others:
+            impulse += rod.state.frame_impulses[1, 1] / np.cos(angle)**2  # forces across the segments
+        friction_moments.append(impulse / 1e-9 * length / 2)
         before = curvature
     return np.array(friction_moments)
 
@@ -47,6 +51,13 @@ def test_moment_and_curvature_go_around_a_closed_loop():
     assert moment[-1] == pytest.approx(moment[80])  # closed
     area = np.sum((moment[81:] + moment[80:-1]) / 2 * np.diff(cycle[80:]))
     assert area == pytest.approx(4 * STIFFNESS * FRICTION * (4 - SLIP), rel=0.02)  # lost in each cycle
+
+
+def test_the_loop_is_the_same_in_the_material_frame():
+    # A DLO with free ends would rather turn about its axis than be bent to the other side.
+    cycle = np.array([SLIP / 2, 4.0, 4 - SLIP, 4 - 2 * SLIP, 2.0, 2 + SLIP, 2 + 2 * SLIP, 4.0])
+    assert moments(cycle, **TWISTS) == pytest.approx(
+        STIFFNESS * FRICTION * np.array([0.5, 1, 0, -1, -1, 0, 1, 1]), abs=0.02 * STIFFNESS * FRICTION)
 
 
 def test_the_loop_is_independent_of_the_rate():
@@ -81,6 +92,80 @@ def test_friction_never_gains_energy(seed, bending, friction, slip, step):
         assert before + stored(rod) < 1.05 * start
         points, velocities = points + step * after, after
     assert before + stored(rod) < start
+
+
+@drawing(20, derandomize=True)
+@given(st.integers(0, 2**32 - 1), st.floats(1e-5, 0.1), st.floats(0.1, 30), st.floats(0.001, 10),
+       st.floats(0.03, 10), st.sampled_from([0.001, 0.004, 0.01]))
+def test_friction_in_the_material_frame_never_gains_energy(seed, bending, friction, slip, torsion, step):
+    generator = np.random.default_rng(seed)
+    rest = generator.uniform(0.02, 0.05, 15)
+    physical = properties(bending, 1e3, 0.05, bending_friction=friction, bending_slip=slip,
+                          **{**TWISTS, 'torsion': torsion})
+    rod = Rod(rest, physical, step)
+    points = crumpled(seed, rest, 0.05)
+    velocities = generator.normal(0, 0.1, points.shape)
+    velocities -= velocities.mean(axis=0)
+
+    def twisted():
+        return (rod.state.twisting * np.diff(rod.state.angles)**2).sum() / 2
+
+    start = None
+    for _ in range(201):
+        before = energy(points, rest, physical) + (rod.state.masses[:, None] * velocities**2).sum() / 2
+        after = rod.velocities(points, velocities, NONE, FREE)
+        before += stored(rod) + twisted()
+        start = before if start is None else start
+        assert before < 1.05 * start
+        points, velocities = points + step * after, after
+    assert before < start
+
+
+def arc(curvature, rest):
+    """Return the (N, 3) [m] points of a part of a circle."""
+    angles = np.concatenate([[0.0], 2 * np.arcsin(curvature * rest / 2).cumsum()])
+    return np.stack([np.sin(angles), 1 - np.cos(angles), 0 * angles], axis=1) / curvature
+
+
+@pytest.mark.parametrize('curvature', [1.0, 3.0])
+def test_a_bent_dlo_that_turns_about_its_axis_rubs(curvature):
+    """
+    Both clamps turn by the same angle, while the DLO stays an arc of curvature k.
+
+    Its curvature then goes around a circle in the material.  The plastic part of it follows on a smaller
+    circle, perpendicular to the strain: its radius is the square root of k^2 - slip^2.  So each metre takes
+    the torque EI friction times that radius, which twist brings there from the clamps.
+    """
+    rest = np.full(24, 0.02)
+    points = arc(curvature, rest)
+    physical = properties(STIFFNESS, 1e4, 0.05, torsion=200.0, bending_friction=FRICTION, bending_slip=SLIP)
+    rod = Rod(rest, physical, 1e-8)
+    rod.hold((0, 1, 23, 24))
+    rod.frame_forces(points)
+    first, last = points[1] - points[0], points[24] - points[23]
+    for _ in range(1000):
+        rod.turned(points, {0: 0.003 * first / 0.02, 23: 0.003 * last / 0.02})
+    twist = rod.state.twisting * np.diff(rod.state.angles)
+    torques = np.diff(twist[1:-1]) / 0.02
+    assert torques == pytest.approx(STIFFNESS * FRICTION * np.sqrt(curvature**2 - SLIP**2), rel=0.02)
+
+
+def test_strands_keep_their_bend_when_a_clamp_opens_and_closes():
+    """With a clamp at an end, they belong to a material frame; without one, to space."""
+    rest = np.full(24, 0.02)
+    physical = properties(STIFFNESS, 1e4, 0.05, torsion=0.5, bending_friction=FRICTION, bending_slip=20.0)
+    rod = Rod(rest, physical, 1e-8)
+    bent, straightened = arc(4.0, rest), arc(0.5, rest)
+    strains = []
+    for nodes, points in (((), bent), ((), straightened), ((0, 1), straightened), ((), straightened)):
+        rod.hold(nodes)
+        for _ in range(2):
+            rod.velocities(points, np.zeros_like(points), NONE, np.zeros((len(nodes), 3)))
+        strains.append(np.linalg.norm(rod.state.plastic[3:, 6:], axis=1))
+    assert strains[0] == pytest.approx(0.0, abs=1e-12)
+    assert strains[1] == pytest.approx(3.5 * 0.02, rel=1e-2)
+    assert strains[2] == pytest.approx(strains[1], rel=1e-9)
+    assert strains[3] == pytest.approx(strains[1], rel=1e-9)
 
 
 @pytest.mark.parametrize('friction', [0.0, 2.0, 5.0])

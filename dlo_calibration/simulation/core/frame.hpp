@@ -9,7 +9,8 @@
 // -EI k_i . (t_i - t_(i-1)), where k_i has the mean angle of both segments.  The twisting energy is
 // GJ / (2 l) (angle_i - angle_(i-1))^2.  A DLO has almost no inertia about its axis, so that its angles
 // minimise the energy: a clamp prescribes them, free ends and pins bear no torque.  With torsion 0, clamps do
-// not prescribe them: the DLO turns freely as a whole and does not twist.
+// not prescribe them: the DLO turns freely as a whole and does not twist.  Where it twists, friction between
+// strands belongs to the frame, see moments.hpp.
 
 namespace dlo {
 namespace DLO_TARGET {
@@ -74,13 +75,6 @@ inline void find_bishop_frame(Rods<Number>& rods, bool begun) {
   }
 }
 
-/// The natural curvature in the Bishop frame.
-template <class Number>
-inline std::array<Number, 2> turned(const Natural<Number>& natural, const Number& cosine,
-                                    const Number& sine) {
-  return {natural.x * cosine - natural.y * sine, natural.x * sine + natural.y * cosine};
-}
-
 /// The bends [N m] in the direction of the natural curvature and across: sums over all joints.
 template <class Number>
 inline std::array<Number, 2> mean_direction(const Rods<Number>& rods) {
@@ -109,11 +103,12 @@ inline void turn_freely(Rods<Number>& rods) {
   const Number cosine = a / length, sine = b / length;
   for (int i = 0; i < joints; ++i) {
     Joint<Number>& joint = all_joints[i];
-    const auto [x, y] = turned(natural[i], cosine, sine);
+    joint.cosine = cosine, joint.sine = sine;
+    const auto [x, y] = turned(natural[i].x, natural[i].y, joint);
     twist = twist + slope;  // no torque is left about the axis of a segment
     slope = (joint.x * y - joint.y * x) / 2;
     twist = twist + slope;
-    joint.cosine = cosine, joint.sine = sine, joint.twist = twist;
+    joint.twist = twist;
   }
 }
 
@@ -168,7 +163,8 @@ inline std::array<Number, 2> added(const Number& cosine, const Number& sine, con
 /// angle of both segments from the plane of the bend.  Where delta changes by less than `kReach`, a parabola
 /// with the curvature |A| (cos(delta) + kReach / 3) is an upper bound, so that a Newton step of at most that
 /// size lowers the energy.  Pivots of a matrix that is not positive definite are replaced (Nocedal and
-/// Wright, Numerical Optimization, 2006, 3.4).
+/// Wright, Numerical Optimization, 2006, 3.4).  The curvature of friction between strands is that of
+/// Gauss and Newton.
 /// `begun`: if false, clamps of unknown direction do not hold yet.
 template <class Number>
 inline void balance_torques(Rods<Number>& rods, const Ropes& ropes, bool begun) {
@@ -178,6 +174,8 @@ inline void balance_torques(Rods<Number>& rods, const Ropes& ropes, bool begun) 
   auto *angles = rods.angles.data(), *clamped = rods.clamped.data();
   const auto* twisting = rods.twisting.data();
   const auto* natural = rods.natural.data();
+  const bool rubs = rods.strands_rub && begun;
+  const auto* moments = rods.moments.data();
   auto* joints = rods.joints.data();
   const auto holds = [&](const Clamp& clamp) { return begun || std::isfinite(clamp.direction.x); };
   for (int i = 0; i < segments; ++i) clamped[i] = none;
@@ -197,11 +195,15 @@ inline void balance_torques(Rods<Number>& rods, const Ropes& ropes, bool begun) 
     if (i < segments - 1) {
       const Joint<Number> joint = joints[i];
       const Number stiffness = twisting[i];
-      const auto [x, y] = turned(natural[i], joint.cosine, joint.sine);
-      const Number slope = (joint.x * y - joint.y * x) / 2;
-      const Number curved = (x * joint.x + y * joint.y +
-                             natural[i].size *
-                                 (kReach / 3 * (abs(joint.x) + abs(joint.y)) + kSteady)) / 4;
+      const auto [x, y] = turned(natural[i].x, natural[i].y, joint);
+      Number slope = (joint.x * y - joint.y * x) / 2;
+      Number curved = (x * joint.x + y * joint.y +
+                       natural[i].size * (kReach / 3 * (abs(joint.x) + abs(joint.y)) + kSteady)) / 4;
+      if (rubs) {
+        const auto [all_x, all_y] = turned(moments[i].x, moments[i].y, joint);
+        slope = (joint.x * all_y - joint.y * all_x) / 2;
+        curved = curved + moments[i].stiffness * (joint.x * joint.x + joint.y * joint.y) / 4;
+      }
       const Number torque = stiffness * (angles[i + 1] - angles[i]);
       coupling = curved - stiffness;
       next_diagonal = stiffness + curved, next_right = -torque - slope;
@@ -265,24 +267,61 @@ inline void begin_frame(Rods<double>& rods, const Ropes& ropes) {
 }
 inline void begin_frame(Rods<Lanes>&, const Ropes&) {}  // never called: a rope's first step is taken alone
 
-/// Add the impulses [N s] of natural curvature and twist.
+/// The mean tangent at a joint, and the first director of the material frame there.
+inline std::array<Point, 2> material(const Rods<double>& rods, int i) {
+  const Point &a = rods.tangents[i], &b = rods.tangents[i + 1];
+  const Point sum = a + b, tangent = 1.0 / max(sqrt(dot(sum, sum)), sqrt(kHairpin)) * sum;
+  const Point across = transported(rods.across[i], a, tangent);
+  return {tangent, rods.joints[i].cosine * across + rods.joints[i].sine * cross(tangent, across)};
+}
+
+/// From now on, the strands of a DLO turn with its material frame, which has just begun.
+inline void enter_frame(Rods<double>& rods) {
+  for (int i = 0; i < rods.nodes - 2; ++i) {
+    const auto [tangent, first] = material(rods, i);
+    const Point second = cross(tangent, first);
+    for (auto* each : {&rods.plastic[i].bend, &rods.plastic[i].strain})
+      *each = {dot(*each, first), dot(*each, second), 0.0};
+  }
+}
+inline void enter_frame(Rods<Lanes>&) {}  // never called, as `begin_frame`
+
+/// From now on, they do not.
+inline void leave_frame(Rods<double>& rods) {
+  find_springs(rods);
+  find_bishop_frame(rods, true);
+  for (int i = 0; i < rods.nodes - 2; ++i) {
+    const auto [tangent, first] = material(rods, i);
+    const Point second = cross(tangent, first);
+    PlasticBend<double>& plastic = rods.plastic[i];
+    for (auto* each : {&plastic.bend, &plastic.strain}) *each = each->x * first + each->y * second;
+    plastic.tangent = tangent;
+  }
+}
+
+/// Add the impulses [N s] of natural curvature, twist and strands that turn with the frame.
 ///
 /// The forces are the exact gradient of the energy of segments that do not turn about their axes.  A couple
 /// of forces at the ends of a segment replaces the torque on it.
 template <class Number>
-inline void add_frame(Rods<Number>& rods, const Ropes& ropes, bool begun) {
+inline void add_frame(Rods<Number>& rods, const Ropes& ropes, bool begun, bool rubbed) {
+  const bool rubs = strands_turn(rods);
   find_bishop_frame(rods, begun);
   if (!rods.twists) {
     turn_freely(rods);
   } else {
     if (!begun) begin_frame(rods, ropes);
+    if (!begun && rubs && rubbed) enter_frame(rods);
+    if (rubs) find_moments(rods, rubbed, false);
     balance_torques(rods, ropes, true);
+    if (rubs) find_moments(rods, rubbed, true), add_stiffness(rods);
   }
   const int joints = rods.nodes - 2;
   const double step = rods.step;
   const auto *tangents = rods.tangents.data(), *across = rods.across.data();
   const auto* all_joints = rods.joints.data();
   const auto* natural = rods.natural.data();
+  const auto* moments = rods.moments.data();
   const auto* inverse_lengths = rods.inverse_lengths.data();
   auto* impulses = rods.frame_impulses.data();
   impulses[0].x = impulses[0].y = impulses[0].z = Number{};
@@ -294,7 +333,7 @@ inline void add_frame(Rods<Number>& rods, const Ropes& ropes, bool begun) {
   for (int i = 0; i < joints; ++i) {
     const Vec3<Number>&a = tangents[i], &b = tangents[i + 1], &u = across[i];
     const Joint<Number>& joint = all_joints[i];
-    const auto [x, y] = turned(natural[i], joint.cosine, joint.sine);
+    const auto [x, y] = turned(rubs ? moments[i].x : natural[i].x, rubs ? moments[i].y : natural[i].y, joint);
     const Number half_x = joint.half * x, half_y = joint.half * y;
     const Vec3<Number> bend = half_x * u + half_y * cross(a, u);
     const Number share = (half_x * joint.x + half_y * joint.y) * (joint.inverse / 2);

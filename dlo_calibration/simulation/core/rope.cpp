@@ -149,6 +149,11 @@ void Rope::hold_frame(const std::vector<bool>& rigid, const std::vector<double>&
   const bool all_rigid = std::find(rigid.begin(), rigid.end(), false) == rigid.end();
   const bool was_framed = rods.framed;
   rods.framed = (curved || !clamps.empty()) && !all_rigid;
+  if (was_framed && frame_begun && !rods.framed && rods.strands_rub && rods.twists) {
+    rods.framed = true;  // its arrays still have the sizes
+    leave_frame(rods);
+    rods.framed = false;
+  }
   if (!rods.framed) frame_begun = false, clamps.clear();
   if (rods.framed != was_framed) rods.resize();
   if (!rods.framed) return;

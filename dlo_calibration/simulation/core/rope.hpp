@@ -61,6 +61,7 @@ struct Strands {
 };
 
 /// The plastic part of the bend at an inner node: the bend at which friction between strands has no stress.
+/// Where strands turn with the material frame, `bend` and `strain` are components in it, with z = 0.
 template <class Number>
 struct PlasticBend {
   Vec3<Number> bend;
@@ -73,6 +74,13 @@ template <class Number>
 struct StrandForce {
   Bending<Number> matrix;  // [kg]
   Vec3<Number> impulse;    // [N s], against the bend
+};
+
+/// Natural curvature and friction between strands at an inner node, in the material frame.
+template <class Number>
+struct Moment {
+  Number x, y;       // what bends the DLO beside its elasticity [N m]
+  Number stiffness;  // of the strands [N m]
 };
 
 /// One DLO of `nodes` nodes, or four like it.
@@ -115,6 +123,7 @@ struct Rods {
   std::vector<Vec3<Number>> tangents, across;
   std::vector<Number> inverse_lengths, clamped, prescribed, turning, upper;
   std::vector<StrandForce<Number>> strand_forces;
+  std::vector<Moment<Number>> moments;
   std::vector<Number> tensions;        // [N] of the segments, in the last step
   Number solved;                       // 1 where the last step was finite
   std::array<Number, 2> last_moves{};  // in the last step, see `Movement`
@@ -136,7 +145,7 @@ struct Rods {
     natural.resize(framed ? inner : 0), twisting.resize(framed ? inner : 0);
     joints.resize(framed ? inner : 0), bishop.resize(framed ? 2 : 0);
     strands.resize(strands_rub ? inner : 0), plastic.resize(strands_rub ? inner : 0);
-    strand_forces.resize(strands_rub ? n : 0);
+    strand_forces.resize(strands_rub ? n : 0), moments.resize(framed && strands_rub ? inner : 0);
     tensions.resize(measured ? segments : 0);
   }
 

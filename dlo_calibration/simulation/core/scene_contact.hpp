@@ -14,7 +14,7 @@ namespace DLO_TARGET {
 
 constexpr double kRigid = 1e6;        // weight of the equation of a contact, relative to the mass that it moves
 constexpr double kCreep = 1e-6;       // m/s; slower sliding counts as none
-constexpr double kFrictionError = 0.3;  // share of the largest friction by which it may be late
+constexpr double kFrictionError = 0.1;  // share of the largest friction by which it may be late
 constexpr int kSolutions = 4, kMostSolutions = 10;  // of the equations of a step; the later ones only release
 constexpr double kLeft = 1e-4;        // m; a gap with which the DLO has left a body
 constexpr double kCorrected = 0.08;   // share of a penetration that one step corrects, as on the table
@@ -175,9 +175,9 @@ inline void find_near(SceneContact& contact, const Point* points, int nodes, dou
 
 /// Call `gap = act(body, node, share, field)` for each node of the near segments that can touch before any
 /// node has moved by `coming` [m], and for each place between two nodes that is nearer to a body than both;
-/// share < 0: it is the node.  Set their room.
-template <class Act>
-inline void each_place(SceneContact& contact, const Point* points, double coming, Act act) {
+/// share < 0: it is the node.  Set their room.  `points(i)` returns a node.
+template <class Points, class Act>
+inline void each_place(SceneContact& contact, Points points, double coming, Act act) {
   int body = -1, node = -1;
   double gap = 0.0;
   Field first{};
@@ -185,13 +185,13 @@ inline void each_place(SceneContact& contact, const Point* points, double coming
     if (near.room > coming) continue;
     const int i = near.segment;
     const Body& at = contact.scene->bodies[near.body];
+    const Point start = points(i), end = points(i + 1);
     if (near.body != body || i != node) {
-      first = field_of(at, points[i]);
+      first = field_of(at, start);
       gap = act(near.body, i, -1.0, first);
     }
-    const Field second = field_of(at, points[i + 1]);
-    const Between between =
-        nearest_between(at, points[i], points[i + 1], first, second, contact.radius + coming);
+    const Field second = field_of(at, end);
+    const Between between = nearest_between(at, start, end, first, second, contact.radius + coming);
     gap = min(gap, between.share < 0.0 ? between.field.distance - contact.radius
                                        : act(near.body, i, between.share, between.field));
     const double next = act(near.body, i + 1, -1.0, second);
@@ -207,7 +207,7 @@ inline std::size_t place_of(const SceneContact& contact, int body, int node, boo
 /// Let what lies in a body at the start stay there.
 inline void begin(SceneContact& contact, const Point* points, int nodes) {
   find_near(contact, points, nodes, 0.0);
-  each_place(contact, points, HUGE_VAL, [&](int body, int node, double share, const Field& field) {
+  each_place(contact, [&](int i) { return points[i]; }, HUGE_VAL, [&](int body, int node, double share, const Field& field) {
     const double gap = field.distance - contact.radius;
     if (!(gap < 0.0)) return gap;
     if (contact.allowed.empty()) contact.allowed.assign(2 * contact.scene->bodies.size() * nodes, 0.0);
@@ -220,7 +220,8 @@ inline void begin(SceneContact& contact, const Point* points, int nodes) {
 
 /// Find the places that may touch a body before a node has moved by `coming` [m]; those that touched it in the
 /// last step keep their state.
-inline void find_touches(SceneContact& contact, const Point* points, const double* inverse_masses, double step,
+template <class Points>
+inline void find_touches(SceneContact& contact, Points points, const double* inverse_masses, double step,
                          double coming) {
   contact.former.swap(contact.touches);
   contact.touches.clear();
@@ -338,7 +339,8 @@ inline void solve_among_bodies(Rods<Number>& rods, const Ropes& ropes) {
     return rope.rods.points.data();
   };
   const auto find = [&](Rope& rope, int lane, double by) {
-    find_touches(rope.surroundings, current(rope, lane), rope.inverse_masses.data(), step, by);
+    find_touches(rope.surroundings, [&](int i) { return in_lane(rods.points[i], lane); },
+                 rope.inverse_masses.data(), step, by);
   };
   for (std::size_t lane = 0; lane < ropes.size(); ++lane) {
     SceneContact& contact = ropes[lane]->surroundings;

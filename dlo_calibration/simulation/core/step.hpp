@@ -6,6 +6,7 @@
 #include "self_contact.hpp"
 #include "rod.hpp"
 #include "strands.hpp"
+#include "moments.hpp"
 #include "frame.hpp"
 #include "scene_contact.hpp"
 
@@ -66,15 +67,14 @@ void predict(Rods<Number>& rods, const Ropes& ropes) {
       ropes[lane]->hand_velocities[h] = {way.x / step, way.y / step, way.z / step};
     }
   constexpr bool kTogether = lanes_of<Number> > 1;  // then each rope has taken its first step
-  if (rods.strands_rub) {
-    find_strand_forces(rods, kTogether || ropes[0]->strands_begun);
-    ropes[0]->strands_begun = true;
-  }
+  const bool rubbed = kTogether || ropes[0]->strands_begun;
+  if (rods.strands_rub && !strands_turn(rods)) find_strand_forces(rods, rubbed);
   find_springs(rods);
   if (rods.framed) {
-    add_frame(rods, ropes, kTogether || ropes[0]->frame_begun);
+    add_frame(rods, ropes, kTogether || ropes[0]->frame_begun, rubbed);
     ropes[0]->frame_begun = true;
   }
+  if (rods.strands_rub) ropes[0]->strands_begun = true;
   hold(rods, ropes);
   const auto has_scene = [](const Rope* rope) { return rope->surroundings.scene != nullptr; };
   if (std::any_of(ropes.begin(), ropes.end(), has_scene)) solve_among_bodies(rods, ropes);
