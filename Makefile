@@ -88,7 +88,8 @@ sanitize: $(TESTED)
 	done | paste -sd:)
 	export ASAN_OPTIONS=detect_leaks=0 PYTHONSAFEPATH=1 PYTHONPATH=build/sanitized/lib
 	$(PYTHON) -c 'from dlo_calibration.simulation.core import _core; assert "sanitized" in _core.__file__'
-	$(PYTHON) -m pytest test/simulation/test_engine_contract.py test/simulation/test_core.py
+	$(PYTHON) -m pytest test/simulation/test_engine_contract.py test/simulation/test_core.py \
+	  test/simulation/test_scene_contact.py
 
 # Whether the core compiles for ARM; it is neither linked nor started.
 aarch64: $(TESTED)

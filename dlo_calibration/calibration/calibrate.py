@@ -86,7 +86,8 @@ def calibrate(trials: Sequence[Trial], options: Options | None = None, *,
         stack.callback(setting.pool.stop)
         result = fitted(setting)
         result = with_outlier(setting, result)
-        confirm = stack.enter_context(confirming(result, second, should_stop, memory))
+        confirm = stack.enter_context(confirming(
+            result, second, should_stop, memory, obstacles=bool(options.scene)))
         result = advised(setting, result)
         result = with_missing_parameters(setting, result)
         result = confirm(result)

@@ -28,7 +28,13 @@ from dlo_calibration.evaluation.pool import cores, Pool, Threads
 from dlo_calibration.evaluation.process_simulator import ProcessSimulator
 from dlo_calibration.evaluation.residuals import compared_rows, Huber, ResidualLayout
 from dlo_calibration.inference.advice import advise
-from dlo_calibration.inference.examination import Confirmation, disagreements, Examination, examine
+from dlo_calibration.inference.examination import (
+    AMONG_OBSTACLES,
+    Confirmation,
+    disagreements,
+    Examination,
+    examine,
+)
 from dlo_calibration.inference.missing_parameters import missing_parameters
 from dlo_calibration.inference.outlier import candidate, is_outlier, Outlier, spread_without
 from dlo_calibration.inference.slices import simulate_slices, Slices
@@ -218,8 +224,8 @@ def second_engine(options: Options, make_simulator: SimulatorFactory, first: str
 
 @contextmanager
 def confirming(result: CalibrationResult, second: Simulator | Exception | None,
-               should_stop: Callable[[], bool] = lambda: False, memory: Memory | None = None
-               ) -> Iterator[Confirm]:
+               should_stop: Callable[[], bool] = lambda: False, memory: Memory | None = None,
+               obstacles: bool = False) -> Iterator[Confirm]:
     """
     Simulate the best parameter set with the second engine while this block executes.
 
@@ -227,6 +233,7 @@ def confirming(result: CalibrationResult, second: Simulator | Exception | None,
 
     :param second: see `second_engine`.
     :param memory: what was simulated before an interruption; None: nothing.
+    :param obstacles: whether there are any; then the engines may differ by more.
     :return: adds the confirmation to a result; it waits for the second engine.
     """
     begun = time.monotonic()
@@ -244,7 +251,8 @@ def confirming(result: CalibrationResult, second: Simulator | Exception | None,
         with closing(threads):
             pool = Pool(second, threads, late, memory)
             try:
-                yield partial(_confirmed, evaluator, pool.begin(evaluator.jobs(result.best.point)))
+                yield partial(_confirmed, evaluator, pool.begin(evaluator.jobs(result.best.point)),
+                              AMONG_OBSTACLES if obstacles else 1.0)
             finally:
                 pool.stop()
 
@@ -253,7 +261,7 @@ def confirmed(result: CalibrationResult, options: Options, make_simulator: Simul
               ) -> CalibrationResult:
     """Return a result with the confirmation by a second engine; see `confirming`."""
     with second_engine(options, make_simulator, result.engine, len(result.trials)) as second, \
-            confirming(result, second) as confirm:
+            confirming(result, second, obstacles=bool(options.scene)) as confirm:
         return confirm(result)
 
 
@@ -268,7 +276,7 @@ def _unconfirmed(error: Exception, result: CalibrationResult) -> CalibrationResu
 
 
 def _confirmed(evaluator: Evaluator, rollouts: Callable[[], Sequence[Rollout | SimulationError]],
-               result: CalibrationResult) -> CalibrationResult:
+               tolerance: float, result: CalibrationResult) -> CalibrationResult:
     """Wait for the second engine, and return a result with its confirmation."""
     best, engine = result.best, evaluator.simulator.name
     try:
@@ -283,7 +291,7 @@ def _confirmed(evaluator: Evaluator, rollouts: Callable[[], Sequence[Rollout | S
     confirmation = Confirmation(engine, other.score, other.scores, other.errors,
                                 float(distances.mean()), float(distances.max()))
     differences = disagreements([trial.name for trial in result.trials], result.chains, chains,
-                                best.scores, other.scores)
+                                best.scores, other.scores, tolerance)
     warnings = result.warnings
     if differences:
         warnings += f'engine {engine} disagrees with engine {result.engine}: {"; ".join(differences)}',

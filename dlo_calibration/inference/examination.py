@@ -34,6 +34,7 @@ from dlo_calibration.model.score import PointErrors
 #: Two engines agree if their points of a trial are no further apart on average [m]: about the
 #: discretisation error of nodes and time step, 0.43 mm on the reference objects (doc/physics.md).
 DISTANCE_TOLERANCE = 0.5e-3
+AMONG_OBSTACLES = 6.0  # times that; PyBullet's contact with them is off by 2 mm (doc/physics.md)
 
 #: Returns the residuals (m,) [m] of points that are being evaluated, None for a failure.
 Pending = Callable[[], Sequence[Floats | None]]
@@ -262,7 +263,8 @@ class Confirmation:
 
 
 def disagreements(names: Sequence[str], chains: Sequence[Floats], others: Sequence[Floats],
-                  scores: Sequence[float], other_scores: Sequence[float]) -> list[str]:
+                  scores: Sequence[float], other_scores: Sequence[float], tolerance: float = 1.0
+                  ) -> list[str]:
     """
     Return a phrase for each trial on which two engines disagree.
 
@@ -271,13 +273,15 @@ def disagreements(names: Sequence[str], chains: Sequence[Floats], others: Sequen
     :param others: the same by the second engine.
     :param scores: difference score of each trial, by the first engine.
     :param other_scores: the same by the second engine.
+    :param tolerance: how many times the usual differences are no disagreement.
     """
     words = []
     for name, points, other_points, score, other_score in zip(
             names, chains, others, scores, other_scores, strict=True):
         distance = float(np.linalg.norm(points - other_points, axis=2).mean())
         # A difference of scores below 5 % or 0.1 cm is too small to prefer one parameter set to another.
-        if distance > DISTANCE_TOLERANCE or abs(other_score - score) > max(0.1, 0.05 * score):
+        if distance > tolerance * DISTANCE_TOLERANCE or (
+                abs(other_score - score) > tolerance * max(0.1, 0.05 * score)):
             words.append(f'{name}: points {distance * 1e3:.2f} mm apart on average, '
                          f'score {other_score:.2f} instead of {score:.2f}')
     return words
