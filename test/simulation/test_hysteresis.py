@@ -133,8 +133,8 @@ def test_a_bent_dlo_that_turns_about_its_axis_rubs(curvature):
     Both clamps turn by the same angle, while the DLO stays an arc of curvature k.
 
     Its curvature then goes around a circle in the material.  The plastic part of it follows on a smaller
-    circle, perpendicular to the strain: its radius is the square root of k^2 - slip^2.  So each metre takes the
-    torque EI friction times that radius, which twist brings there from the clamps.
+    circle, perpendicular to the strain: its radius is the square root of k^2 - slip^2.  So each metre takes
+    the torque EI friction times that radius, which twist brings there from the clamps.
     """
     rest = np.full(24, 0.02)
     points = arc(curvature, rest)
