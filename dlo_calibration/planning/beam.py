@@ -218,10 +218,14 @@ class BeamSearch:
         return [*carrying(*given), *leading(*given, objective.posts)]
 
     @cached_property
+    def _first_moves(self) -> list[tuple[Move, ...]]:
+        return self._moves(self._start.points)
+
+    @property
     def expected(self) -> int:
         """Number of actions to simulate if all permitted actions are needed; an estimate."""
         actions = self._options.actions
-        moves = len(self._moves(self._start.points))
+        moves = len(self._first_moves)
         following = moves + REFINED * (2 * self._options.hands + len(SHARES))
         displacements = 2 * actions * self._options.hands
         return int(following * (1 + WIDTH * (actions - 1))
@@ -302,7 +306,7 @@ class BeamSearch:
         """Return the best sequences with one more move, best first."""
         drafts: list[Draft] = []
         for sequence in beam:
-            for choices in self._moves(sequence.end):
+            for choices in self._first_moves if sequence is self._root else self._moves(sequence.end):
                 each = [Draft(sequence, (move,), sequence.chains[-1:]) for move in choices]
                 drafts += list(filter(self._permits, each))[:1]
         simulated = yield from self._tried(drafts)

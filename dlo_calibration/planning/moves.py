@@ -24,6 +24,7 @@ MOST_PAIRED_GRIPS = 6  # places along the DLO where two hands may grip, in pairs
 MOST_PIVOTS = 7  # places along the DLO from which on a part is led
 HANDS_APART = 0.04  # m between two hands, as grippers have a size
 SHORTEST_LEG = 1e-6  # m; a shorter part of a path has no duration
+OVER = 4  # points of the goal from one corner of a way over it to the next
 NOTHING = Surroundings()
 STRAIGHT = frozen_array(np.zeros((0, 2)))
 
@@ -118,7 +119,8 @@ def carrying(points: Floats, goal: Floats, kinds: Sequence[str], hands: int,
     moves = []
     for kind in kinds:
         for grip in grips(len(points), MOST_GRIPS):
-            moves += _ways(kind, grip, points, goal[[grip], :2], hands, surroundings)
+            to = goal[[grip], :2]
+            moves += _ways(kind, grip, points, to, to, hands, surroundings)
         for pair in pairs:
             shifts = (goal - points)[list(pair), :2]
             moves.append(tuple(Move(kind, pair, names, shifts) for names in (HANDS, HANDS[::-1])))
@@ -146,24 +148,25 @@ def leading(points: Floats, goal: Floats, kinds: Sequence[str], hands: int, surr
                 continue
             for grip in grips(last + 1, MOST_GRIPS)[-2:]:
                 way = np.concatenate([now[pivot:grip][::-1], then[pivot:grip + 1]])[:, :2]
+                over = np.concatenate([now[[pivot]], then[pivot:grip:OVER], then[[grip]]])[:, :2]
                 for kind in kinds:
-                    moves += _ways(kind, int(order[grip]), points, way, hands, surroundings)
+                    moves += _ways(kind, int(order[grip]), points, way, over, hands, surroundings)
     return list({(each.name, each.grips, each.corners.tobytes(), each.shifts.tobytes()): choices
                  for choices in moves for each in choices[:1]}.values())
 
 
-def _ways(kind: str, grip: int, points: Floats, way: Floats, hands: int, surroundings: Surroundings
-          ) -> list[tuple[Move, ...]]:
+def _ways(kind: str, grip: int, points: Floats, way: Floats, over: Floats, hands: int,
+          surroundings: Surroundings) -> list[tuple[Move, ...]]:
     """
-    Return the moves in which a hand takes a grip along a way, (w, 2) [m], and around bodies.
+    Return the moves in which a hand takes a grip along a way, around bodies; a lifted one also goes over them.
 
-    A lifted one also goes straight, over the bodies, if that is another way.
+    :param way: (w, 2) [m] places that the hand passes; `over` (v, 2) those that it passes above bodies.
     """
-    begin = points[grip]
-    ways = [np.vstack([begin[:2], way])]
+    begin, ways = points[grip], [way]
     if surroundings.bodies:
-        around = surroundings.way(ways[0], float(begin[2]))
-        over = ways[0] if kind == LIFTING and len(way) == 1 and (around is None or len(around) > 2) else None
-        ways = [each for each in (around, over) if each is not None]
-    return [tuple(Move(kind, (grip,), (name,), each[-1] - begin[:2], frozen_array(each[1:-1]))
+        around = surroundings.way(np.vstack([begin[:2], way]), float(begin[2]))
+        ways = [] if around is None else [around[1:]]
+        if kind == LIFTING and (around is None or len(around) > 2):
+            ways.append(over)
+    return [tuple(Move(kind, (grip,), (name,), each[-1] - begin[:2], frozen_array(each[:-1]))
                   for name in HANDS[:hands]) for each in ways]

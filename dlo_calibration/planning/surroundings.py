@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 import heapq
-from typing import Self, Sequence
+from typing import Iterator, Self, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.action import Action
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.planning.limits import Box
 from dlo_calibration.simulation import core
 from dlo_calibration.simulation.scene import core_body, Obstacle
 
@@ -26,6 +25,9 @@ STRIDE = 5e-4  # m; shortest step along a way whose clearance is checked
 SAME = 1e-6  # m; places that are nearer to each other are one
 PUSHES = 20  # at most, of a place out of bodies
 MOST_CORNERS = 300  # that a search for a way looks from, at most
+MOST_BODIES = 40  # that a way goes around, at most: the nearest ones
+UPRIGHT = 0.7  # least vertical part of the direction in which a body is left by what lies on it
+SUNK = 2e-3  # m that a point of the DLO may be lower, or inside a body: noise
 OPEN = 4  # corners of a round outline for each of CORNERS, where it is drawn
 
 
@@ -72,38 +74,46 @@ class Standing:
     A body that stands around the DLO.
 
     :param body: that the core knows the distances from.
-    :param box: that encloses it.
+    :param lower: (3,) [m] lowest coordinates of the box around it; `upper` (3,) highest ones.
+    :param clearance: that hands keep from it [m].
     :param corners: (c, 2) [m] of a polygon around it and its clearance, seen from above.
     """
 
     body: core.Body
-    box: Box
+    lower: Floats
+    upper: Floats
+    clearance: float
     corners: Floats
 
     @classmethod
-    def of(cls, obstacle: Obstacle, clearance: float) -> Self:
-        """Return an obstacle; a mesh that is not closed counts as the box around it."""
-        points, radius = _extremes(obstacle)
-        box = Box(points.min(axis=0) - radius, points.max(axis=0) + radius)
+    def of(cls, obstacle: Obstacle, clearance: float, points: Floats) -> Self:
+        """
+        Return an obstacle; a mesh that is not closed counts as the box around it.
+
+        From one on which the DLO lies, hands keep only as far as the DLO itself.
+
+        :param points: (m, 3) [m] where the DLO lies.
+        """
+        extremes, radius = _extremes(obstacle)
+        lower, upper = extremes.min(axis=0) - radius, extremes.max(axis=0) + radius
         try:
             body = core_body(obstacle)
         except InputError:
-            body = core.Body('box', (box.upper - box.lower) / 2, (box.upper + box.lower) / 2,
-                             np.eye(3).ravel(), 1.0)
-        return cls(body, box, outline(obstacle, CORNERS, clearance + SPARE))
+            body = core.Body('box', (upper - lower) / 2, (upper + lower) / 2, np.eye(3).ravel(), 1.0)
+        step = np.array([0.0, 0.0, STRIDE])
+        on_it = [distance for place in points if (distance := body.distance(place)) < clearance
+                 and body.distance(place + step) - body.distance(place - step) > 2 * UPRIGHT * STRIDE]
+        clearance = max(min([clearance, *(distance - SUNK for distance in on_it)]), 0.0)
+        return cls(body, lower, upper, clearance, outline(obstacle, CORNERS, clearance + SPARE))
 
     @property
     def middle(self) -> Floats:
         """Its middle, seen from above, (2,) [m]."""
-        return np.asarray((self.box.lower + self.box.upper)[:2] / 2)
+        return np.asarray((self.lower + self.upper)[:2] / 2)
 
-    def within(self, margin: float) -> Box:
-        """Return the box that encloses all places nearer than a margin [m]."""
-        return Box(self.box.lower - margin, self.box.upper + margin)
-
-    def clear(self, begin: Floats, end: Floats, distance: float) -> bool:
+    def clear(self, begin: Floats, end: Floats) -> bool:
         """
-        Tell whether a straight way keeps a distance [m] from the body.
+        Tell whether a straight way keeps the clearance.
 
         At each place, the way is clear as far as the body is further away than that.
 
@@ -112,7 +122,7 @@ class Standing:
         length, along = float(np.linalg.norm(end - begin)), 0.0
         direction = (end - begin) / max(length, SAME)
         while True:
-            spare = self.body.distance(begin + along * direction) - distance
+            spare = self.body.distance(begin + along * direction) - self.clearance
             if spare < -SAME:
                 return False
             if along >= length:
@@ -123,33 +133,60 @@ class Standing:
 @dataclass(frozen=True)
 class Surroundings:
     """
-    All bodies around a DLO, and the clearance that hands keep from them.
+    All bodies around a DLO.
 
-    :param clearance: [m].
+    :param bodies: in the order of the scene.
     """
 
     bodies: tuple[Standing, ...] = ()
-    clearance: float = 0.0
 
     @classmethod
-    def of(cls, obstacles: Sequence[Obstacle], clearance: float) -> Self:
-        """Return the surroundings of the obstacles of a scene."""
-        return cls(tuple(Standing.of(obstacle, clearance) for obstacle in obstacles), clearance)
+    def of(cls, obstacles: Sequence[Obstacle], clearance: float, *chains: Floats) -> Self:
+        """
+        Return the surroundings of the obstacles of a scene.
+
+        :param clearance: that hands keep from them [m].
+        :param chains: (n, 3) [m] where the DLO lies.
+        """
+        points = np.concatenate([np.zeros((0, 3)), *chains])
+        return cls(tuple(Standing.of(obstacle, clearance, points) for obstacle in obstacles))
 
     @cached_property
-    def _margins(self) -> list[Box]:
-        return [body.within(self.clearance) for body in self.bodies]
+    def _margins(self) -> Floats:
+        """Lowest and highest corners of the boxes that enclose bodies and their clearance, (2, b, 3) [m]."""
+        return np.array([[body.lower - body.clearance for body in self.bodies],
+                         [body.upper + body.clearance for body in self.bodies]]).reshape(2, -1, 3)
 
-    def distance(self, place: Floats) -> float:
-        """Return the distance of a place, (3,) [m], from the nearest body; infinity without one."""
-        return min((body.body.distance(place) for body in self.bodies), default=np.inf)
+    def _near(self, begin: Floats, end: Floats) -> Iterator[tuple[int, Standing]]:
+        """Yield the number of a straight way, and a body to which it comes nearer than the clearance."""
+        lower, upper = self._margins
+        # Boxes around way and body that do not overlap are far from each other.
+        overlap = ((np.minimum(begin, end)[:, None] <= upper) & (np.maximum(begin, end)[:, None] >= lower))
+        for way, body in np.argwhere(overlap.all(axis=2)):
+            if not self.bodies[body].clear(begin[way], end[way]):
+                yield int(way), self.bodies[body]
+
+    def spare(self, place: Floats) -> float:
+        """Return by how much a place, (3,) [m], keeps the clearance of all bodies [m]; infinity without one."""
+        lower, upper = self._margins
+        least = np.linalg.norm(np.maximum(np.maximum(lower - place, place - upper), 0.0), axis=1)
+        spare = np.inf
+        for k in np.argsort(least, kind='stable'):
+            if least[k] >= spare:
+                break
+            spare = min(spare, self.bodies[k].body.distance(place) - self.bodies[k].clearance)
+        return float(spare)
+
+    def cover(self, place: Floats) -> bool:
+        """Tell whether a place, (3,) [m], is inside a body."""
+        return any(body.body.distance(place) < -SUNK for body in self.bodies)
 
     def refusal(self, action: Action) -> str:
         """Return which hand comes too near to a body: a phrase, empty if none does."""
         for hand in action.hands if self.bodies else ():
             way = hand.positions if len(hand.positions) > 1 else hand.positions[[0, 0]]
-            if not self.clear(way[:-1], way[1:]).all():
-                return f'{hand.name} comes nearer to a body than {1e3 * self.clearance:g} mm'
+            for _, body in self._near(way[:-1], way[1:]):
+                return f'{hand.name} comes nearer to a body than {1e3 * body.clearance:.3g} mm'
         return ''
 
     def clear(self, begin: Floats, end: Floats) -> NDArray[np.bool_]:
@@ -160,9 +197,8 @@ class Surroundings:
         :returns: (m,)
         """
         clear = np.ones(len(begin), bool)
-        for body, margin in zip(self.bodies, self._margins, strict=True):
-            for k in np.flatnonzero(clear & margin.entered(begin, end)):
-                clear[k] = body.clear(begin[k], end[k], self.clearance)
+        for way, _ in self._near(begin, end):
+            clear[way] = False
         return clear
 
     def above(self, way: Floats, height: float) -> float:
@@ -172,13 +208,11 @@ class Surroundings:
         :param way: (w, 2) [m] places that it passes straight.
         """
         while True:
-            places = np.column_stack([way, np.full(len(way), height)])
-            near = [body for body, margin in zip(self.bodies, self._margins, strict=True)
-                    for k in np.flatnonzero(margin.entered(places[:-1], places[1:]))
-                    if not body.clear(places[k], places[k + 1], self.clearance)]
-            if not near:
+            places = _raised(way, height)
+            tops = [float(body.upper[2]) + body.clearance for _, body in self._near(places[:-1], places[1:])]
+            if not tops:
                 return height
-            height = max(float(body.box.upper[2]) for body in near) + self.clearance + SPARE
+            height = max(tops) + SPARE
 
     def way(self, places: Floats, height: float) -> Floats | None:
         """
@@ -200,18 +234,15 @@ class Surroundings:
                 way += part
         return self._shortened(np.array(way), height)
 
-    def _raised(self, places: Floats, height: float) -> Floats:
-        return np.column_stack([places, np.full(len(places), height)])
-
     def _pushed(self, place: Floats, height: float) -> Floats | None:
         """Return the place, (2,) [m], moved out of the clearance of bodies; None if that does not succeed."""
         place = np.array(place, float)
         for _ in range(PUSHES):
-            lack = self.clearance + SPARE - self.distance(np.append(place, height))
+            lack = SPARE - self.spare(np.append(place, height))
             if lack <= SPARE / 2:
                 return place
-            uphill = np.array([self.distance(np.append(place + step, height))
-                               - self.distance(np.append(place - step, height))
+            uphill = np.array([self.spare(np.append(place + step, height))
+                               - self.spare(np.append(place - step, height))
                                for step in np.eye(2) * STRIDE]) / (2 * STRIDE)
             slope = float(np.linalg.norm(uphill))
             if slope < 0.1:  # as above the middle of a body
@@ -221,15 +252,16 @@ class Surroundings:
 
     def _around(self, begin: Floats, end: Floats, height: float) -> list[Floats] | None:
         """Return the places that the shortest way from begin to end, both (2,) [m], passes after begin."""
-        low, high = self._raised(begin[None], height), self._raised(end[None], height)
-        if self.clear(low, high)[0]:
+        if self.clear(_raised(begin[None], height), _raised(end[None], height))[0]:
             return [end]
-        corners = np.concatenate([[end], *(body.corners for body, margin in zip(
-            self.bodies, self._margins, strict=True) if margin.lower[2] < height < margin.upper[2])])
+        low, high = self._margins[..., 2]
+        around = [self.bodies[k] for k in np.flatnonzero((low < height) & (height < high))]
+        around.sort(key=lambda body: float(np.linalg.norm(2 * body.middle - begin - end)))
+        corners = np.concatenate([[end], *(body.corners for body in around[:MOST_BODIES])])
         # A* (Hart, Nilsson and Raphael 1968) on the visibility graph of the corners, whose edges are checked
         # only where the search comes.
         far = np.linalg.norm(corners - end, axis=1)
-        raised, costs = self._raised(corners, height), np.full(len(corners), np.inf)
+        raised, costs = _raised(corners, height), np.full(len(corners), np.inf)
         before, done = np.full(len(corners), -1), np.zeros(len(corners), bool)
         queue: list[tuple[float, int]] = [(0.0, -1)]
         for _ in range(MOST_CORNERS):
@@ -245,7 +277,7 @@ class Surroundings:
                 done[at] = True
             reached = spent + np.linalg.norm(corners - here, axis=1)
             tried = np.flatnonzero(~done & (reached < costs - SAME))
-            origin = np.repeat(self._raised(here[None], height), len(tried), axis=0)
+            origin = np.repeat(_raised(here[None], height), len(tried), axis=0)
             for k in tried[self.clear(origin, raised[tried])]:
                 costs[k], before[k] = reached[k], at
                 heapq.heappush(queue, (float(reached[k] + far[k]), int(k)))
@@ -257,7 +289,7 @@ class Surroundings:
         places, k = list(way), 1
         while k < len(places) - 1:
             corner = np.array(places[k - 1:k + 2])
-            line = self._raised(corner[[0, 2]], height)
+            line = _raised(corner[[0, 2]], height)
             if not _inside(middles, corner).any() and self.clear(line[:1], line[1:])[0]:
                 del places[k]
                 k = max(k - 1, 1)
@@ -274,7 +306,7 @@ class Surroundings:
         points = np.concatenate(chains)
         lowest = points[:, 2].min()
         return np.array([body.middle for body in self.bodies
-                         if body.box.lower[2] <= lowest <= body.box.upper[2]
+                         if body.lower[2] <= lowest <= body.upper[2]
                          and not any(body.body.distance([x, y, lowest]) < 0 for x, y, _ in points)]
                         ).reshape(-1, 2)
 
@@ -294,6 +326,10 @@ def passed_wrongly(points: Floats, goal: Floats, posts: Floats) -> int:
     angles = np.diff(np.arctan2(away[..., 1], away[..., 0]), axis=1)
     turns = ((angles + np.pi) % (2 * np.pi) - np.pi).sum(axis=1) / (2 * np.pi)
     return int(np.abs(turns.round()).sum())
+
+
+def _raised(places: Floats, height: float) -> Floats:
+    return np.column_stack([places, np.full(len(places), height)])
 
 
 def _traced(corners: Floats, before: NDArray[np.int64]) -> list[Floats]:

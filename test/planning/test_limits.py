@@ -208,7 +208,8 @@ def values(declaration):
 def test_the_defaults_of_a_plan_and_the_options_that_no_file_may_set():
     assert PlanOptions().flat() == DEFAULTS
     assert {declaration.of for declaration in DECLARED.values()} == {MACHINE, SEARCH}
-    robot = {'height', 'speed', 'reach_1', 'reach_2', 'no_go', 'clearance', 'least_bend_radius', 'most_tension'}
+    robot = {'height', 'speed', 'reach_1', 'reach_2', 'no_go', 'clearance', 'least_bend_radius',
+             'most_tension'}
     assert {name for name in DECLARED if DECLARED[name].of == MACHINE} == {'workers', *robot}
 
 
