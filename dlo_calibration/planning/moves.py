@@ -25,6 +25,7 @@ MOST_PIVOTS = 7  # places along the DLO from which on a part is led
 HANDS_APART = 0.04  # m between two hands, as grippers have a size
 SHORTEST_LEG = 1e-6  # m; a shorter part of a path has no duration
 OVER = 4  # points of the goal from one corner of a way over it to the next
+HIGHEST = 0.25  # of the length; over higher posts, no DLO is carried
 NOTHING = Surroundings()
 STRAIGHT = frozen_array(np.zeros((0, 2)))
 
@@ -39,6 +40,7 @@ class Move:
     :param hands: names of the hands, one for each grip.
     :param shifts: (h, 2) [m] horizontal displacement of each hand.
     :param corners: (c, 2) [m] places that the way of one hand passes; two hands move straight.
+    :param over: height of what a lift has to carry the DLO over [m].
     """
 
     name: str
@@ -46,6 +48,7 @@ class Move:
     hands: tuple[str, ...]
     shifts: Floats
     corners: Floats = field(default_factory=lambda: STRAIGHT)
+    over: float = -np.inf
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'shifts', frozen_array(np.reshape(self.shifts, (len(self.grips), 2))))
@@ -65,7 +68,7 @@ class Move:
         corners = [np.column_stack([np.tile(corner, (len(begin), 1)), level]) for corner in self.corners]
         way = [begin, *corners, end]
         if self.name == LIFTING:
-            top = max(begin[:, 2].max(), level.max()) + height
+            top = max(begin[:, 2].max(), level.max(), self.over) + height
             for passed in np.stack(way, axis=1):
                 top = surroundings.above(passed[:, :2], top)
             lifted = [np.column_stack([place[:, :2], np.full(len(place), top)]) for place in way]
@@ -134,13 +137,18 @@ def leading(points: Floats, goal: Floats, kinds: Sequence[str], hands: int, surr
 
     A hand takes the DLO near an end, goes back along it as far as a pivot, and from there along the goal:
     what follows the hand then passes all posts as the goal does.  The way is as short as the posts permit.
+    Or a hand carries any part to its place in the goal, so high that the DLO passes over the posts.
 
     :param posts: (p, 2) [m]; the other arguments are those of `carrying`.
     """
     wrong, last = passed_wrongly(points, goal, posts), len(points) - 1
     if not wrong:
         return []
-    moves = []
+    top = surroundings.top(posts)
+    length = float(np.linalg.norm(np.diff(goal, axis=0), axis=1).sum())
+    low = LIFTING in kinds and top - goal[:, 2].min() < HIGHEST * length
+    moves = [tuple(Move(LIFTING, (grip,), (name,), goal[grip, :2] - points[grip, :2], over=top)
+                   for name in HANDS[:hands]) for grip in grips(last + 1, MOST_GRIPS * low)]
     for order in (np.arange(last + 1), np.arange(last, -1, -1)):
         now, then = points[order], goal[order]
         for pivot in grips(last + 1, MOST_PIVOTS)[:-1]:
@@ -151,7 +159,7 @@ def leading(points: Floats, goal: Floats, kinds: Sequence[str], hands: int, surr
                 over = np.concatenate([now[[pivot]], then[pivot:grip:OVER], then[[grip]]])[:, :2]
                 for kind in kinds:
                     moves += _ways(kind, int(order[grip]), points, way, over, hands, surroundings)
-    return list({(each.name, each.grips, each.corners.tobytes(), each.shifts.tobytes()): choices
+    return list({(each.name, each.grips, each.over, each.corners.tobytes(), each.shifts.tobytes()): choices
                  for choices in moves for each in choices[:1]}.values())
 
 

@@ -297,6 +297,10 @@ class Surroundings:
                 k += 1
         return np.array(places)
 
+    def top(self, posts: Floats) -> float:
+        """Return the height of the highest of `posts` [m]."""
+        return max(float(body.upper[2]) for body in self.bodies if (body.middle == posts).all(axis=1).any())
+
     def posts(self, *chains: Floats) -> Floats:
         """
         Return the middles of the bodies that chains, (n, 3) [m], lie beside, not on: (p, 2) [m].
