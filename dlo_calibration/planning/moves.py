@@ -166,7 +166,7 @@ def leading(points: Floats, goal: Floats, kinds: Sequence[str], hands: int, surr
 def _ways(kind: str, grip: int, points: Floats, way: Floats, over: Floats, hands: int,
           surroundings: Surroundings) -> list[tuple[Move, ...]]:
     """
-    Return the moves in which a hand takes a grip along a way, around bodies; a lifted one also goes over them.
+    Return the moves in which a hand takes a grip along a way around bodies; lifted, also over them.
 
     :param way: (w, 2) [m] places that the hand passes; `over` (v, 2) those that it passes above bodies.
     """

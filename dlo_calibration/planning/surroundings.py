@@ -167,7 +167,7 @@ class Surroundings:
                 yield int(way), self.bodies[body]
 
     def spare(self, place: Floats) -> float:
-        """Return by how much a place, (3,) [m], keeps the clearance of all bodies [m]; infinity without one."""
+        """Return by how much a place, (3,) [m], keeps more than the clearance of all bodies [m]."""
         lower, upper = self._margins
         least = np.linalg.norm(np.maximum(np.maximum(lower - place, place - upper), 0.0), axis=1)
         spare = np.inf

@@ -40,7 +40,7 @@ COLUMNS = 3  # of panels, at most
 BODY = '#8c7b6b'
 
 
-def write_plan_picture(plan: Plan, path: str | Path, obstacles: Sequence[Obstacle] = ()) -> None:
+def write_plan_picture(plan: Plan, path: str | Path, *, obstacles: Sequence[Obstacle] = ()) -> None:
     """
     Write a PNG with a panel an action: the DLO before it and as predicted after it, the goal, and the hands.
 

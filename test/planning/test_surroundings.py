@@ -78,15 +78,17 @@ def test_a_way_keeps_the_clearance_and_passes_bodies_at_the_given_side(side, tur
     assert (np.sign(places[np.abs(places[:, 0] - 0.3) < 0.1, 1]) == side).all()
     places = np.column_stack([places, np.full(len(places), LEVEL)])
     assert min(distances(places, (x, y)).min() for x, y in ((0.2, 0.0), (0.3, 0.01))) >= CLEARANCE - 1e-5
-    local = (places[:, :2] - (0.4, 0)) @ np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    cosine, sine = np.cos(turn), np.sin(turn)
+    local = (places[:, :2] - (0.4, 0)) @ np.array([[cosine, -sine], [sine, cosine]])
     assert np.linalg.norm(np.maximum(np.abs(local) - (0.01, 0.03), 0), axis=1).min() >= CLEARANCE - 1e-5
 
 
 def test_a_place_that_a_ring_of_bodies_encloses_has_no_way():
     ring = [post(0.1 * np.cos(angle), 0.1 * np.sin(angle)) for angle in np.linspace(0, 2 * np.pi, 24)]
     around = Surroundings.of(ring, CLEARANCE)
-    assert around.way(np.array([[0.0, 0.0], [0.3, 0.0]]), LEVEL) is None
-    assert around.above(np.array([[0.0, 0.0], [0.3, 0.0]]), LEVEL) == pytest.approx(HEIGHT + CLEARANCE, abs=2e-3)
+    out = np.array([[0.0, 0.0], [0.3, 0.0]])
+    assert around.way(out, LEVEL) is None
+    assert around.above(out, LEVEL) == pytest.approx(HEIGHT + CLEARANCE, abs=2e-3)
 
 
 def test_the_outline_encloses_a_body_closely():
@@ -166,8 +168,8 @@ def test_hands_come_as_near_to_a_body_as_the_dlo_that_lies_on_it(scene_of):
 def test_a_wall_that_no_hand_passes_is_named(scene_of):
     wall = box((0.01, 2.0, 2.0), (0.7, 0.0, 1.0))
     goal = Chain(straight().points + [0.8, 0, 0])
-    result = plan(DLO, straight(), goal, replace(ONE, actions=1, kinds=('drag',), reach_1='box -1 -.5 0 2 .5 .5'),
-                  simulation=Options(scene=scene_of(wall)))
+    options = replace(ONE, actions=1, kinds=('drag',), reach_1='box -1 -.5 0 2 .5 .5')
+    result = plan(DLO, straight(), goal, options, simulation=Options(scene=scene_of(wall)))
     assert not result.reached
     assert any('reach' in warning for warning in result.warnings)
 
