@@ -12,7 +12,7 @@ import json
 from pathlib import Path
 import sys
 
-from dlo_calibration.calibration.engines import SimulatorFactory
+from dlo_calibration.calibration.engines import obstacles_of, SimulatorFactory
 from dlo_calibration.calibration.options import FileOptions, Options, SIMULATION
 from dlo_calibration.cli.arguments import add_options, given_options
 from dlo_calibration.cli.output import print_json, print_message, print_sentences
@@ -30,7 +30,7 @@ from dlo_calibration.signals import StopFlag
 from dlo_calibration.writing import Attempts, make_folder, whole
 
 PLAN = 'plan'  # begins the names of files
-OF_PLACE = ('table', 'table_height')  # options that say where the DLO lies
+OF_PLACE = ('table', 'table_height', 'scene')  # options that say where the DLO lies
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -102,7 +102,7 @@ def write_plan_files(folder: Path, plan: Plan, description: Description, simulat
         with attempts.attempt(f'{PLAN}.xml'):
             write_request(path.with_suffix('.xml'), plan_request(plan, description, simulation))
     with attempts.attempt(f'{PLAN}.png'):
-        write_plan_picture(plan, path.with_suffix('.png'))
+        write_plan_picture(plan, path.with_suffix('.png'), obstacles=obstacles_of(simulation))
     if plan.actions:
         with attempts.attempt(f'{PLAN}.gif'), closing(make_simulator(simulation)) as simulator:
             write_plan_animation(plan, simulator, Posterior.of(description).best, path.with_suffix('.gif'))

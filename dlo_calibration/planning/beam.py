@@ -17,9 +17,10 @@ from dlo_calibration.evaluation.linearisation import broyden, Differences, Linea
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.score import difference_score, difference_vector
 from dlo_calibration.planning.limits import crossings
-from dlo_calibration.planning.moves import carrying, clash, Move
+from dlo_calibration.planning.moves import carrying, clash, leading, Move, NOTHING
 from dlo_calibration.planning.options import PlanOptions, SCORE
 from dlo_calibration.planning.rehearsal import ActionStep, in_turn, Rehearsal, RehearsalJob
+from dlo_calibration.planning.surroundings import passed_wrongly, Surroundings
 
 REFERENCE = 0  # focal point of the score: the first point, because no hand holds the DLO after a plan
 
@@ -36,6 +37,7 @@ PRICE = 1.08  # factor on the cost that an action must save
 NEAR = 2.0  # times the tolerance; below that cost, all displacements are refined together
 TOGETHER = 3  # Gauss-Newton steps for all displacements of a sequence
 PATIENCE = 1  # consecutive actions that need not gain anything
+OTHER_SIDE = 0.15  # share of the length that counts as a distance for each body passed at the wrong side
 SELDOM = 0.1  # share of the draws in which the DLO may bear more than permitted
 
 Result = TypeVar('Result')
@@ -52,11 +54,14 @@ class Objective:
 
     :param start: whose marked points are features, too.
     :param kind: `points` or `score`.
+    :param surroundings: bodies that the DLO has to pass at the side at which the goal does.
     :ivar goal: points of the goal, (n, 3) [m].
     """
 
-    def __init__(self, start: Chain, goal: Chain, kind: str) -> None:
+    def __init__(self, start: Chain, goal: Chain, kind: str, surroundings: Surroundings = NOTHING) -> None:
         self.goal = goal.points
+        self.posts = surroundings.posts(start.points, goal.points)  # (p, 2) [m]
+        self._detour = OTHER_SIDE * start.length
         self._scored = kind == SCORE
         marked = np.flatnonzero(start.features | goal.features)
         self._features: NDArray[np.intp] = marked if len(marked) else np.array([0, len(goal) - 1])
@@ -64,7 +69,10 @@ class Objective:
 
     def cost(self, points: Floats) -> float:
         """Return what is minimised [m], for an (n, 3) [m] chain."""
-        return self.error(points) + (self.score(points) / 100 / self._terms if self._scored else 0.0)
+        cost = self.error(points) + (self.score(points) / 100 / self._terms if self._scored else 0.0)
+        if len(self.posts):
+            cost += self._detour * passed_wrongly(points, self.goal, self.posts)
+        return cost
 
     def residuals(self, points: Floats) -> Floats:
         """Return (m,) residuals [m], whose sum of squares is minimised in place of the cost."""
@@ -159,14 +167,15 @@ class BeamSearch:
     :param tolerance: cost [m] at which the goal counts as reached.
     :param levels: (n,) heights [m] at which the points are put down.
     :param physical: the best parameters by name (SI units); `draws` are draws from their posterior.
+    :param surroundings: bodies that the hands keep clear of.
     """
 
     def __init__(self, start: Chain, objective: Objective, tolerance: float, options: PlanOptions,
-                 levels: Floats, physical: Mapping[str, float], draws: Sequence[Mapping[str, float]]
-                 ) -> None:
+                 levels: Floats, physical: Mapping[str, float], draws: Sequence[Mapping[str, float]],
+                 surroundings: Surroundings = NOTHING) -> None:
         self._start = start
         self._objective, self._tolerance, self._options = objective, tolerance, options
-        self._limits = options.limits
+        self._limits, self._surroundings = options.limits, surroundings
         self._levels, self._physical, self._draws = levels, physical, draws
         self._crossings = max(crossings(start.points), crossings(objective.goal))
         self._root = MoveSequence((), start.points[None], objective.cost(start.points))
@@ -202,12 +211,21 @@ class BeamSearch:
         """Whether the start, or the end of the best judged sequence, is within the tolerance of the goal."""
         return not self._judged_rank[0]
 
+    def _moves(self, points: Floats) -> list[tuple[Move, ...]]:
+        """Return the moves to try on a DLO with (n, 3) points [m], each with all choices of hands."""
+        options, objective = self._options, self._objective
+        given = points, objective.goal, options.kinds, options.hands, self._surroundings
+        return [*carrying(*given), *leading(*given, objective.posts)]
+
+    @cached_property
+    def _first_moves(self) -> list[tuple[Move, ...]]:
+        return self._moves(self._start.points)
+
     @property
     def expected(self) -> int:
         """Number of actions to simulate if all permitted actions are needed; an estimate."""
         actions = self._options.actions
-        moves = len(carrying(self._start.points, self._objective.goal, self._options.kinds,
-                             self._options.hands))
+        moves = len(self._first_moves)
         following = moves + REFINED * (2 * self._options.hands + len(SHARES))
         displacements = 2 * actions * self._options.hands
         return int(following * (1 + WIDTH * (actions - 1))
@@ -288,8 +306,7 @@ class BeamSearch:
         """Return the best sequences with one more move, best first."""
         drafts: list[Draft] = []
         for sequence in beam:
-            for choices in carrying(sequence.end, self._objective.goal, self._options.kinds,
-                                    self._options.hands):
+            for choices in self._first_moves if sequence is self._root else self._moves(sequence.end):
                 each = [Draft(sequence, (move,), sequence.chains[-1:]) for move in choices]
                 drafts += list(filter(self._permits, each))[:1]
         simulated = yield from self._tried(drafts)
@@ -344,11 +361,13 @@ class BeamSearch:
         return [outcomes.get(id(draft)) for draft in drafts]
 
     def _steps(self, moves: Sequence[Move], before: Floats) -> tuple[ActionStep, ...]:
-        return in_turn([move.step(points, self._levels, self._options.height, self._options.speed)
+        return in_turn([move.step(points, self._levels, self._options.height, self._options.speed,
+                                  self._surroundings)
                         for move, points in zip(moves, before, strict=True)])
 
     def _permits(self, draft: Draft) -> bool:
-        return all(self._allowed(self._limits.refusal(step.action) or clash(step.action))
+        return all(self._allowed(self._limits.refusal(step.action) or clash(step.action)
+                                 or self._surroundings.refusal(step.action))
                    for step in self._steps(draft.moves, draft.before))
 
     def _allowed(self, refusal: str) -> bool:

@@ -89,8 +89,7 @@ class Posterior:
         The height at which it lies bounds its radius: trials in which it does not touch itself leave the
         radius open, and a draw with a far larger one would push its parts away from each other.
         """
-        level = lying_level(chain, simulation.table_height) if simulation.table and not simulation.scene \
-            else None
+        level = lying_level(chain, simulation.table_height) if simulation.table else None
         if level is None:
             return self
         return replace(self, thickest=max(level - simulation.table_height, self.best['self_collision']))

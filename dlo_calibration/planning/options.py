@@ -47,6 +47,9 @@ class PlanOptions(DeclaredOptions):
         (), "boxes that neither a hand nor the DLO may enter, each 'x0 y0 z0 x1 y1 z1', two opposite corners "
         'in metres in the frame of the table; they should be larger than what they protect by the size of '
         'the gripper, as a hand counts as a point', of=MACHINE)
+    clearance: float = declared(
+        0.015, 'distance that the hands keep from the bodies of a scene; the DLO may touch them', unit='m',
+        minimum=0.001, maximum=1.0, of=MACHINE)
     least_bend_radius: float = declared(
         0.0, 'smallest radius to which actions may bend the DLO, e.g. that of a data sheet; at most '
         'one draw in ten may be bent more sharply; 0: any', unit='m', minimum=0.0, maximum=10.0, of=MACHINE)

@@ -14,14 +14,14 @@ from typing import Callable, Iterator, Mapping
 import numpy as np
 
 from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
-from dlo_calibration.calibration.engines import SimulatorFactory
+from dlo_calibration.calibration.engines import obstacles_of, SimulatorFactory
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.evaluation.pool import Pool, Threads
 from dlo_calibration.model.action import Action, Hand
-from dlo_calibration.model.chain import Chain, frozen_array
+from dlo_calibration.model.chain import Chain, Floats, frozen_array
 from dlo_calibration.model.parameters import GRAVITY, natural_curvature
-from dlo_calibration.observation.table import HANGING, lying_level
+from dlo_calibration.observation.table import HANGING, lying_level, RESTING_BAND
 from dlo_calibration.planning.beam import BeamSearch, JudgedSequence, Objective
 from dlo_calibration.planning.dlo import CalibratedDlo, intervals, Posterior
 from dlo_calibration.planning.limits import crossings, HANDS
@@ -29,6 +29,7 @@ from dlo_calibration.planning.loads import loads_of_actions
 from dlo_calibration.planning.options import PlanOptions
 from dlo_calibration.planning.plan import Plan, PlannedAction
 from dlo_calibration.planning.rehearsal import ActionStep, RehearsalJob, Rehearser
+from dlo_calibration.planning.surroundings import passed_wrongly, Surroundings
 
 START, GOAL = 'start chain', 'goal chain'  # in errors
 OTHER_LENGTH = 0.10  # share of the length; with a larger difference, the unit or the DLO is another one
@@ -42,7 +43,8 @@ def checked(dlo: CalibratedDlo, start: Chain, goal: Chain, simulation: Options,
     Return the start and the goal that a plan is made for.
 
     The goal is resampled at the points of the start, as fractions of the length, if it has other points.  It
-    is moved to the height of the start, because both lie on the same table.
+    is moved to the height of the start, because both lie on the same table, unless one of them lies on a
+    body of a scene.
 
     :raises InputError: if the result lacks values; if the start or the goal has another length than the DLO,
         or is in the air; if the goal is in a no-go box, or has more crossings than the start although
@@ -53,8 +55,8 @@ def checked(dlo: CalibratedDlo, start: Chain, goal: Chain, simulation: Options,
     _check_length(GOAL, goal, start.length, 'the start')
     if simulation.table and not simulation.scene:
         rise = _level(START, start, simulation.table_height) - _level(GOAL, goal, simulation.table_height)
-    elif simulation.scene:  # the height of obstacles is unknown
-        rise = 0.0
+    elif simulation.scene:
+        rise = _rise_on_table(start, goal, simulation)
     else:
         raise InputError('parameter table', 'false, and no scene', 'something that the DLO lies on',
                          'leave table at true, or name a scene')
@@ -109,6 +111,31 @@ def _level(thing: str, chain: Chain, table_height: float) -> float:
             'above the table', 'a DLO that lies on the table, as hands open after each action',
             'lay it down, or correct table_height')
     return level
+
+
+def _rise_on_table(start: Chain, goal: Chain, simulation: Options) -> float:
+    """Return how much higher the start lies on the table than the goal [m]; 0 if one lies on a body."""
+    here, there = (lying_level(chain, simulation.table_height) for chain in (start, goal))
+    if not simulation.table or here is None or there is None or abs(here - there) > RESTING_BAND:
+        return 0.0
+    return here - there
+
+
+def _levels(start: Chain, goal: Chain, simulation: Options) -> Floats:
+    """Return the heights (n,) [m] at which points are put down: on the table, but for those on a body."""
+    level = lying_level(start, simulation.table_height) if simulation.table else None
+    z = goal.points[:, 2]
+    if level is None:
+        return z
+    return np.where((np.abs(z - level) < RESTING_BAND) | (not simulation.scene), level, z)
+
+
+def _check_bodies(goal: Chain, surroundings: Surroundings) -> None:
+    """Raise the InputError if the middle line of a goal is inside a body."""
+    inside = sum(map(surroundings.cover, goal.points))
+    if inside:
+        raise InputError(GOAL, f'{inside} of {len(goal)} points inside a body of the scene',
+                         'a goal beside or on all bodies', 'move the goal, or correct the scene')
 
 
 def _matched(goal: Chain, start: Chain, rise: float) -> Chain:
@@ -246,17 +273,19 @@ def plan(dlo: CalibratedDlo, start: Chain, goal: Chain, options: PlanOptions | N
     :param simulation: options of the simulation; None: the defaults.
     :param should_stop: once it is True, the best plan so far is returned.
     :param executor: its workers simulate, e.g. a `ClusterExecutor`; None: as many threads as options say.
-    :raises InputError: if start, goal and DLO do not belong together; see `checked`.
+    :raises InputError: if start, goal and DLO do not belong together, see `checked`; if a body of the scene
+        covers the goal.
     """
     options, simulation, begin = options or PlanOptions(), simulation or Options(), clock()
     start, goal = checked(dlo, start, goal, simulation, options)
+    surroundings = Surroundings.of(obstacles_of(simulation), options.clearance, start.points,
+                                   goal.points)
+    _check_bodies(goal, surroundings)
     posterior = Posterior.of(dlo).lying(start, simulation)
     tolerance = options.tolerance / 100 * start.length
-    objective = Objective(start, goal, options.objective)
-    level = None if simulation.scene else lying_level(start, simulation.table_height)
-    search = BeamSearch(start, objective, tolerance, options,
-                        goal.points[:, 2] if level is None else np.full(len(start), level), posterior.best,
-                        posterior.draws(options.draws, options.seed))
+    objective = Objective(start, goal, options.objective, surroundings)
+    search = BeamSearch(start, objective, tolerance, options, _levels(start, goal, simulation),
+                        posterior.best, posterior.draws(options.draws, options.seed), surroundings)
 
     def report(rollouts: int) -> None:
         expected = max(search.expected, rollouts)
@@ -276,6 +305,7 @@ def plan(dlo: CalibratedDlo, start: Chain, goal: Chain, options: PlanOptions | N
             while jobs := search.ask():
                 search.tell(last(jobs))
         warnings = () if search.reached else (*goal_warnings(last, posterior, start, goal, options),
+                                              *_warnings_of_sides(objective, search),
                                               *_warnings_of_refusals(search.refusals))
     ends = [start.points] if search.judged is None else [
         rehearsal.chains[-1] for rehearsal in search.judged.drawn or [search.judged.best]]
@@ -300,6 +330,17 @@ def planned_actions(judged: JudgedSequence, error: float) -> tuple[PlannedAction
         PlannedAction(move.name, step.starting(0.0).action, frozen_array(judged.best.chains[k]),
                       frozen_array(lower[k]), frozen_array(upper[k]), loads[k])
         for k, (move, step) in enumerate(zip(judged.sequence.moves, judged.steps, strict=True)))
+
+
+def _warnings_of_sides(objective: Objective, search: BeamSearch) -> Iterator[str]:
+    """Warn of bodies that the DLO passes at another side at the end of a plan than in the goal."""
+    if search.judged is None:
+        return
+    ends = [rehearsal.chains[-1] for rehearsal in (search.judged.best, *search.judged.drawn)]
+    wrong = [passed_wrongly(end, objective.goal, objective.posts) for end in ends]
+    if any(wrong):
+        yield (f'at the end, the DLO still passes {max(wrong)} bod{"y" if max(wrong) == 1 else "ies"} at '
+               f'another side than in the goal, in {np.count_nonzero(wrong)} of {len(wrong)} simulations')
 
 
 def _warnings_of_refusals(refusals: Mapping[str, int]) -> Iterator[str]:

@@ -293,7 +293,7 @@ def plan_sentences(plan: Plan) -> list[str]:
     """Return sentences on the actions, whether they reach the goal or why the search ended, and warnings."""
     steps = []
     for k, action in enumerate(plan.actions, start=1):
-        hands = '; '.join(_hand(plan.start, hand, 'drags', 2) for hand in action.action.hands)
+        hands = '; '.join(_hand(plan.start, hand, 'drags', 2, corners=True) for hand in action.action.hands)
         steps.append(f'{k}. {action.name}: {hands}; then the points are '
                      f'{distance(plan, action.predicted)} from the goal on average.'
                      f'{_borne(plan.start, action.loads)}')
@@ -367,18 +367,23 @@ def _hands(start: Chain, step: PredictedStep) -> str:
                      for hand, end in zip(hands, after, strict=True))
 
 
-def _hand(start: Chain, hand: Hand, on_the_table: str, axes: int, after: str = 'opens') -> str:
+def _hand(start: Chain, hand: Hand, on_the_table: str, axes: int, after: str = 'opens',
+          corners: bool = False) -> str:
     """
     Say what a hand does.
 
     :param on_the_table: what it does where it does not lift the DLO.
     :param axes: number of coordinates to name of the place that it goes to.
     :param after: what it does there.
+    :param corners: whether to name the places where its way turns, seen from above.
     """
     places, rise = start.arc_lengths(), float(hand.positions[:, 2].max() - hand.positions[0, 2])
     way = f'lifts {number(100 * rise)} cm, carries' if rise > FLAT else on_the_table
     grip = grip_place(places, hand.grips[0], hand.offset) / places[-1]
-    return (f'{hand.name} grips at {grip:.2f} of the length, {way} it to '
+    turns = [place for place in hand.positions[1:-1, :axes] if corners and not np.isclose(
+        place[:2], hand.positions[[0, -1], :2]).all(axis=1).any()]
+    past = f'past {", ".join(map(_place, turns))} ' if turns else ''
+    return (f'{hand.name} grips at {grip:.2f} of the length, {way} it {past}to '
             f'{_place(hand.positions[-1, :axes])} m and {after}')
 
 

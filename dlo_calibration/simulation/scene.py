@@ -116,10 +116,11 @@ def core_scene(obstacles: Sequence[Obstacle]) -> core.Scene:
 
     :raises InputError: if a mesh has no inside.
     """
-    return core.Scene([_body(obstacle) for obstacle in obstacles])
+    return core.Scene([core_body(obstacle) for obstacle in obstacles])
 
 
-def _body(obstacle: Obstacle) -> core.Body:
+def core_body(obstacle: Obstacle) -> core.Body:
+    """Return one of the bodies of `core_scene`."""
     from scipy.spatial.transform import Rotation  # slow to load
 
     turn = Rotation.from_quat(obstacle.turn).as_matrix().ravel()

@@ -54,7 +54,7 @@ def run(capsys):
     return run
 
 
-def drawn(plan, *words):
+def drawn(plan, *words, **_):
     """Stand for drawing a plan to a file, the last of the words."""
     with whole(words[-1]) as new:
         new.touch()
@@ -117,6 +117,17 @@ def test_each_action_is_described_and_whether_the_goal_is_reached(run, chains, p
     assert text.endswith('The goal is longer than the DLO.')
 
 
+def test_a_plan_around_the_posts_of_a_scene_says_what_the_hand_passes_and_names_the_scene(run, tmp_path):
+    samples = ROPE.parents[1] / 'chains'
+    code, output, notes = run(
+        'plan', ROPE, '--from', samples / 'start.csv', '--to', samples / 'around_posts.csv', '--scene',
+        samples / 'posts.urdf', '--draws', 0, '--workers', 1, '--output', tmp_path)
+    assert code == 0, notes
+    assert 'past (' in output and 'The goal is reached' in output
+    assert 'scene' in str(read_request(tmp_path / 'plan.xml').file_options.refusal)  # of another folder
+    assert (tmp_path / 'plan.png').is_file()
+
+
 @pytest.mark.parametrize(('flags', 'words'), [
     (('--least-bend-radius', 5), 'bent more sharply than least_bend_radius, 5000 mm'),
     (('--most-tension', 0.001), 'pulled harder than most_tension, 0.001 N')])
@@ -160,7 +171,7 @@ def test_a_file_that_cannot_be_written_prevents_no_other_and_no_output(run, chai
 
 
 def test_the_plan_is_printed_before_the_drawings(run, chains, planned, tmp_path, monkeypatch):
-    def stopped(*_):
+    def stopped(*_, **__):
         raise KeyboardInterrupt(130)
 
     planned()

@@ -185,7 +185,7 @@ DECLARED = {declaration.name: declaration for declaration in PlanOptions.declara
 DEFAULTS = {
     'actions': 4, 'hands': 1, 'kinds': ['grasp_and_place', 'drag'], 'objective': 'points', 'tolerance': 1.0,
     'crossings': False, 'draws': 8, 'seed': 1, 'height': 0.05, 'speed': 0.1, 'reach_1': '', 'reach_2': '',
-    'no_go': [], 'least_bend_radius': 0.0, 'most_tension': 0.0, 'workers': 0}
+    'no_go': [], 'clearance': 0.015, 'least_bend_radius': 0.0, 'most_tension': 0.0, 'workers': 0}
 #: Texts that are options, where not every text is.
 TEXTS = {'reach_1': ['', 'box 0 0 0 1 1 1', 'annulus 0.1 -2 0 1e3'],
          'no_go': ['0 0 0 1 1 1', '-1 -1 0 1 1 .5']}
@@ -208,7 +208,8 @@ def values(declaration):
 def test_the_defaults_of_a_plan_and_the_options_that_no_file_may_set():
     assert PlanOptions().flat() == DEFAULTS
     assert {declaration.of for declaration in DECLARED.values()} == {MACHINE, SEARCH}
-    robot = {'height', 'speed', 'reach_1', 'reach_2', 'no_go', 'least_bend_radius', 'most_tension'}
+    robot = {'height', 'speed', 'reach_1', 'reach_2', 'no_go', 'clearance', 'least_bend_radius',
+             'most_tension'}
     assert {name for name in DECLARED if DECLARED[name].of == MACHINE} == {'workers', *robot}
 
 

@@ -16,12 +16,13 @@ from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.planning.dlo import Posterior
 from dlo_calibration.report.drawing import View
 from dlo_calibration.report.figure import BAND, blank_figure, SIMULATED
-from dlo_calibration.report.plan_drawing import plan_trial, write_plan_animation, write_plan_picture
+from dlo_calibration.report.plan_drawing import BODY, plan_trial, write_plan_animation, write_plan_picture
 from dlo_calibration.report.sentences import plan_sentences
+from dlo_calibration.simulation.scene import NO_TRIANGLES, Obstacle
 
 
-def pixels(plan, path):
-    write_plan_picture(plan, path)
+def pixels(plan, path, **keywords):
+    write_plan_picture(plan, path, **keywords)
     return np.asarray(Image.open(path).convert('RGB')).astype(int)
 
 
@@ -35,6 +36,14 @@ def test_a_picture_has_a_panel_for_each_action(tmp_path):
     assert of_colour(none, SIMULATED) == 0 < of_colour(one, SIMULATED) < of_colour(two, SIMULATED)
     assert of_colour(none, BAND) == 0 < min(of_colour(one, BAND), of_colour(two[:, :550], BAND),
                                             of_colour(two[:, 550:], BAND))
+
+
+def test_a_picture_shows_the_bodies_of_a_scene(tmp_path):
+    post = Obstacle('cylinder', np.array([0.1, 0.02]), np.array([0.3, 0.05, 0.05]),
+                    np.array([0, 0, 0, 1.0]), 1.0, NO_TRIANGLES)
+    bare, shown = (pixels(made_up_plan(actions=1), tmp_path / 'plan.png', obstacles=obstacles)
+                   for obstacles in ((), (post,)))
+    assert of_colour(bare, BODY) == 0 and of_colour(shown, BODY) > 500
 
 
 def test_a_picture_that_cannot_be_written_is_an_input_error(tmp_path):
