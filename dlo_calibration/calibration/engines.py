@@ -30,17 +30,22 @@ def _bullet(options: Options) -> Simulator:
     content = f'scene {options.scene}' if options.scene else 'trials'
     if find_spec('pybullet') is None:
         raise NoPyBullet('engine bullet', 'no PyBullet', 'that library', 'install it: pip install pybullet')
-    make = functools.partial(bullet_simulator, engine_settings(options), _obstacles(options))
+    make = functools.partial(bullet_simulator, engine_settings(options), obstacles_of(options))
     return ProcessSimulator('bullet', make, content, options.answer_limit)
 
 
 def _compiled(options: Options) -> Simulator:
     from dlo_calibration.simulation.compiled import CompiledSimulator
 
-    return CompiledSimulator(obstacles=_obstacles(options), **engine_settings(options))
+    return CompiledSimulator(obstacles=obstacles_of(options), **engine_settings(options))
 
 
-def _obstacles(options: Options) -> tuple[Obstacle, ...]:
+def obstacles_of(options: Options) -> tuple[Obstacle, ...]:
+    """
+    Return the obstacles of the option `scene`; none if it is empty.
+
+    :raises InputError: if the scene cannot be read.
+    """
     return read_scene(options.scene) if options.scene else ()
 
 
@@ -57,7 +62,7 @@ def engine_digest(options: Options) -> str:
 
     :raises InputError: if the scene cannot be read.
     """
-    return digest(engine_settings(options), _obstacles(options), code_digest(DECISIVE))
+    return digest(engine_settings(options), obstacles_of(options), code_digest(DECISIVE))
 
 
 #: name -> constructor, which imports its engine only when called

@@ -12,6 +12,7 @@ from typing import Mapping
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from dlo_calibration.calibration.engines import obstacles_of
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.result import ParameterEstimate
 from dlo_calibration.inference.uncertainty import NOT_IDENTIFIABLE
@@ -21,7 +22,7 @@ from dlo_calibration.observation.noise import NO_NOISE, noise_of, smooth
 from dlo_calibration.observation.table import lying_level, rest_on
 from dlo_calibration.planning.dlo import CalibratedDlo
 from dlo_calibration.simulation.nodes import feature_shares, spread_places
-from dlo_calibration.simulation.scene import Obstacle, read_scene
+from dlo_calibration.simulation.scene import Obstacle
 
 LEVEL_TOLERANCE = 1e-3  # m; a table that is moved by less is not worth a warning
 LENGTH_TOLERANCE = 0.05  # of the length; a chain that differs by more may belong to another DLO
@@ -153,7 +154,7 @@ class ExportedRope:
             bending_friction=physical.get('bending_friction', 0.0),
             bending_slip=physical.get('bending_slip', 0.0),
             table=None if not options.table else options.table_height if level is None else level - radius,
-            obstacles=read_scene(options.scene) if options.scene else (),
+            obstacles=obstacles_of(options),
             point_places=frozen_array(chain.arc_lengths() * lengths.sum() / places[-1]),
             values=_values(dlo),
             warnings=(*_undetermined(dlo), *_assumed(dlo, physical, chain),

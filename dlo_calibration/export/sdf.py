@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from dlo_calibration.calibration.engines import obstacles_of
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.export.bodies import COLOUR, corners_and_faces
 from dlo_calibration.export.rope import ExportedRope
@@ -28,7 +29,7 @@ from dlo_calibration.files.xml import add, add_comment, document, new_root
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.parameters import measured
 from dlo_calibration.planning.dlo import CalibratedDlo
-from dlo_calibration.simulation.scene import Obstacle, read_scene, SIZES, stl_octets
+from dlo_calibration.simulation.scene import Obstacle, SIZES
 
 NAME = 'dlo'  # begins the names of links, joints and frames
 VERSION = '1.9'  # Gazebo Fortress and later
@@ -73,15 +74,17 @@ def sdf_meshes(options: Options) -> dict[str, bytes]:
 
     :raises InputError: if the scene cannot be read.
     """
-    return dict(_mesh_file(obstacle) for obstacle in (read_scene(options.scene) if options.scene else ())
+    return dict(_mesh_file(obstacle) for obstacle in (obstacles_of(options))
                 if obstacle.shape == 'mesh')
 
 
 def _mesh_file(obstacle: Obstacle) -> tuple[str, bytes]:
     """Return the name and the content of the file of a mesh, which is scaled."""
     corners, faces = corners_and_faces(obstacle)
-    content = stl_octets(corners[faces])
-    return f'mesh_{sha256(content).hexdigest()[:12]}.stl', content
+    lines = [*('v ' + ' '.join(f'{value:.9g}' for value in corner) for corner in corners.tolist()),
+             *('f ' + ' '.join(map(str, face)) for face in (faces + 1).tolist()), '']
+    content = '\n'.join(lines).encode()
+    return f'mesh_{sha256(content).hexdigest()[:12]}.obj', content  # Drake reads .obj, but no .stl
 
 
 def _add_obstacles(model: Any, rope: ExportedRope) -> None:

@@ -140,14 +140,22 @@ def test_a_verdict_of_a_stranger_cannot_end_the_comment():
     assert 'stiffness EI: ' in model.find('.').getchildren()[0].text
 
 
-def test_drake_reads_it():
+def test_drake_reads_it(tmp_path):
     parsing = pytest.importorskip('pydrake.multibody.parsing', reason='needs Drake')
     from pydrake.multibody.plant import MultibodyPlant
 
+    options = Options(nodes=13, scene=write_scene(tmp_path))
+    (tmp_path / 'model.sdf').write_text(export_sdf(MadeUpDlo(), arc(), options=options))
+    for name, content in sdf_meshes(options).items():
+        (tmp_path / name).write_bytes(content)
     plant = MultibodyPlant(1e-3)
-    parsing.Parser(plant).AddModelsFromString(export_sdf(MadeUpDlo(), arc(), options=OPTIONS), 'sdf')
+    parsing.Parser(plant).AddModels(str(tmp_path / 'model.sdf'))
     plant.Finalize()
-    assert plant.num_positions() == 7 + 2 * 11
+    assert plant.num_positions() == 7 + 2 * 11  # the obstacles do not move
+    context = plant.CreateDefaultContext()
+    for number, obstacle in enumerate(ExportedRope.of(MadeUpDlo(), arc(), options).obstacles):
+        pose = plant.EvalBodyPoseInWorld(context, plant.GetBodyByName(f'obstacle_{number}'))
+        assert pose.translation() == pytest.approx(obstacle.position)
 
 
 def test_the_obstacles_of_the_scene_are_a_static_model(tmp_path):
