@@ -74,7 +74,7 @@ def sdf_meshes(options: Options) -> dict[str, bytes]:
 
     :raises InputError: if the scene cannot be read.
     """
-    return dict(_mesh_file(obstacle) for obstacle in (obstacles_of(options))
+    return dict(_mesh_file(obstacle) for obstacle in obstacles_of(options)
                 if obstacle.shape == 'mesh')
 
 
