@@ -42,9 +42,9 @@ def _compiled(options: Options) -> Simulator:
 
 def obstacles_of(options: Options) -> tuple[Obstacle, ...]:
     """
-    Return the obstacles of the scene, if there is one.
+    Return the obstacles of the option `scene`; none if it is empty.
 
-    :raises InputError: if it cannot be read.
+    :raises InputError: if the scene cannot be read.
     """
     return read_scene(options.scene) if options.scene else ()
 

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Document: all that a person entered about photographs of a DLO: scales, clicks, and the steps of the hands.
+Document: all that a person entered about photographs: scales, clicks, obstacles, and the steps of the hands.
 
 It is plain JSON, which the page edits.  `Document.of` checks it: it may be a stranger's.
 """
@@ -22,6 +22,8 @@ VERSION = 1
 MOST_PHOTOGRAPHS = 200
 MOST_TRIALS = 100
 MOST_STEPS = 20  # of a trial
+MOST_OBSTACLES = 20
+PEG, BOX = 'peg', 'box'
 MOST_CLICKS = 50  # of a photograph; likewise its known points and crossings
 NAME_LENGTH = 255  # characters of a photograph's name
 LARGEST_PIXEL = 1e5  # px
@@ -146,6 +148,26 @@ class PhotographEntry:
 
 
 @dataclass(frozen=True)
+class ObstacleEntry:
+    """
+    An obstacle that stands on the table.
+
+    :param photograph: id of the one in which it was clicked.
+    :param first: pixel of the middle of a peg's top, or of a corner of a box's top.
+    :param second: pixel of the rim of the peg's top, or of the opposite corner of the box's.
+    :param height: [m].
+    :param turn: angle from x of the table to an edge of a box, anticlockwise seen from above [rad].
+    """
+
+    photograph: str = entry_field(_id)
+    kind: str = entry_field(lambda entry: entry.choice([PEG, BOX]))
+    first: Pixel = entry_field(_pixel)
+    second: Pixel = entry_field(_pixel)
+    height: float = entry_field(lambda entry: entry.number(1e-3, 2.0), 0.05)
+    turn: float = entry_field(lambda entry: entry.number(-3.2, 3.2), 0.0)
+
+
+@dataclass(frozen=True)
 class TrialEntry:
     """
     A trial: the ids of its photographs, and the steps of the hands.
@@ -177,6 +199,8 @@ class Document:
         _each('photograph', MOST_PHOTOGRAPHS, lambda entry: entry.record(PhotographEntry)), ())
     trials: tuple[TrialEntry, ...] = entry_field(
         _each('trial', MOST_TRIALS, lambda entry: entry.record(TrialEntry)), ())
+    obstacles: tuple[ObstacleEntry, ...] = entry_field(
+        _each('obstacle', MOST_OBSTACLES, lambda entry: entry.record(ObstacleEntry)), ())
 
     def __post_init__(self) -> None:
         if len(self.by_id) < len(self.photographs):
@@ -184,6 +208,8 @@ class Document:
         for number, trial in enumerate(self.trials, start=1):
             for identity in trial.photographs:
                 self._require(identity, f'trial {number}')
+        for number, obstacle in enumerate(self.obstacles, start=1):
+            self._require(obstacle.photograph, f'obstacle {number}')
         for number, photograph in enumerate(self.photographs, start=1):
             self._check_scale(photograph, f'photograph {number}')
 

@@ -34,6 +34,7 @@ from dlo_calibration.writing import make_folder, whole, write_file
 
 DOCUMENT, LENS, LOCK = 'project.json', 'lens.yaml', '.lock'
 PHOTOGRAPHS, CALIBRATION = 'photographs', 'result'  # folders in it
+SCENE = 'obstacles.urdf'  # the obstacles of the document; also in the folder of the result
 MOST_OCTETS = 4 * 2**20  # of the document; a full one has 2 MB
 MOST_FILES = 400  # photographs, with the removed ones
 MOST_OCTETS_OF_ALL = 4 * 2**30  # of these
@@ -199,7 +200,8 @@ def _refuse_links(folder: Path) -> None:
 
     :raises InputError: for the first link, FIFO or other special file.
     """
-    paths = [folder / name for name in (DOCUMENT, LENS, LOCK, PHOTOGRAPHS, CALIBRATION, SESSION, REQUEST)]
+    paths = [folder / name for name in (DOCUMENT, LENS, LOCK, PHOTOGRAPHS, CALIBRATION, SESSION, REQUEST,
+                                      SCENE)]
     try:
         while paths:
             path = paths.pop()

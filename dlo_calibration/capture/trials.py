@@ -21,6 +21,7 @@ from dlo_calibration.capture.document import TrialEntry
 from dlo_calibration.capture.hands import held_after, Hold, move, Movements, PAUSE
 from dlo_calibration.capture.json_values import plain
 from dlo_calibration.capture.measurement import Measurement, Measurer, numbers
+from dlo_calibration.capture.obstacles import place_obstacles, PlacedObstacle, seen_obstacle
 from dlo_calibration.capture.project import Project
 from dlo_calibration.capture.trial_warnings import check_axes, check_hands, check_photograph, TrialWarnings
 from dlo_calibration.errors import InputError
@@ -35,6 +36,7 @@ from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.parameters import BY_NAME, SCALE
 from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.simulation.nodes import spread_places
+from dlo_calibration.simulation.scene import Obstacle
 from dlo_calibration.vision.axis import Axis
 from dlo_calibration.vision.two_views import axis_of_two_views
 
@@ -190,11 +192,13 @@ class Drafts:
     :param photographs: the measurement of each photograph, by its id.
     :param trials: in the order of the document.
     :param mass: of the DLO [kg]; 0: unknown.
+    :param placed: the obstacles, or why they cannot be placed, in the order of the document.
     """
 
     photographs: Mapping[str, Measurement]
     trials: tuple[TrialDraft, ...]
     mass: float = 0.0
+    placed: tuple[PlacedObstacle, ...] = ()
 
     @cached_property
     def complete(self) -> tuple[Trial, ...]:
@@ -204,8 +208,13 @@ class Drafts:
 
     @cached_property
     def digest(self) -> str:
-        """Digest of the trials and their options."""
-        return digest(tuple(draft.trial for draft in self.trials), self.options)
+        """Digest of the trials, their options and the obstacles."""
+        return digest(tuple(draft.trial for draft in self.trials), self.options, *self.obstacles)
+
+    @cached_property
+    def obstacles(self) -> tuple[Obstacle, ...]:
+        """The obstacles, without those that cannot be placed."""
+        return tuple(placed for placed in self.placed if isinstance(placed, Obstacle))
 
     @property
     def diameter(self) -> float | None:
@@ -227,8 +236,18 @@ class Drafts:
 
     def plain(self) -> dict[str, Any]:
         """Return the drafts as plain values, for the page."""
-        return {'photographs': {name: photograph.plain for name, photograph in self.photographs.items()},
-                'trials': [draft.plain for draft in self.trials]}
+        return {'photographs': {name: {**photograph.plain, 'obstacles': self._outlines(photograph)}
+                                for name, photograph in self.photographs.items()},
+                'trials': [draft.plain for draft in self.trials],
+                'obstacles': [{'sizes': None, 'problem': str(placed)} if isinstance(placed, InputError) else
+                              {'sizes': numbers(placed.sizes, 6), 'problem': None} for placed in self.placed]}
+
+    def _outlines(self, photograph: Measurement) -> list[list[Any]]:
+        """Return the lines around top and foot of each obstacle, in pixels; none without a scale."""
+        scale = photograph.scale
+        return [] if scale is None else [
+            [numbers(line) for line in seen_obstacle(obstacle, scale) if np.isfinite(line).all()]
+            for obstacle in self.obstacles]
 
 
 class Drafter:
@@ -261,7 +280,8 @@ class Drafter:
             self._drafts[number] = before[number] if same else (
                 key, draft_trial(number, entry, photographs, held))
             goal, held_in_goal = entry.goal, held_after(entry.steps, held)
-        return Drafts(photographs, tuple(draft for _, draft in self._drafts.values()), document.dlo.mass)
+        return Drafts(photographs, tuple(draft for _, draft in self._drafts.values()), document.dlo.mass,
+                      place_obstacles(document, photographs))
 
 
 def write_session(path: Path, trials: Sequence[Trial], options: Mapping[str, Any]) -> None:

@@ -6,15 +6,15 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import Callable, Mapping
 
 from dlo_calibration.calibration.engines import SimulatorFactory
-from dlo_calibration.calibration.options import Options
 from dlo_calibration.cli.arguments import add_options, given_options
 from dlo_calibration.cli.output import print_message
 from dlo_calibration.errors import InputError, one_of
-from dlo_calibration.export import export_mjcf, export_sdf, export_usd
+from dlo_calibration.export import export_mjcf, export_sdf, export_usd, sdf_meshes
 from dlo_calibration.export.mjcf import FORMS as MJCF_FORMS
 from dlo_calibration.export.rope import ExportedRope
 from dlo_calibration.export.usd import FORMS as USD_FORMS
@@ -22,7 +22,7 @@ from dlo_calibration.files.chain_file import read_chain_file
 from dlo_calibration.files.result import read_result
 from dlo_calibration.writing import write_file
 
-USED = ('nodes', 'table', 'table_height')  # options
+USED = ('nodes', 'table', 'table_height', 'scene')  # options
 #: Format -> what makes its text, and the names of its forms, the first one by default.
 FORMATS: Mapping[str, tuple[Callable[..., str], tuple[str, ...]]] = {
     'mjcf': (export_mjcf, MJCF_FORMS), 'usd': (export_usd, USD_FORMS), 'sdf': (export_sdf, ())}
@@ -51,10 +51,12 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     for warning in description.file_options.warnings:
         print_message(warning)
     recorded = {name: value for name, value in description.file_options.values.items() if name in USED}
-    options = Options.of({**recorded, **given_options(chosen)})
+    options = replace(description.file_options, values=recorded).options(given_options(chosen))
     chain = read_chain_file(chosen.start)
     form = {} if chosen.form is None else {'form': chosen.form}
     text = export(description, chain, options=options, **form)
+    for name, content in sdf_meshes(options).items() if chosen.format == 'sdf' else ():
+        write_file(chosen.output.parent / name, content)
     write_file(chosen.output, text)
     for warning in ExportedRope.of(description, chain, options).warnings:
         print_message(warning)

@@ -9,7 +9,7 @@ import argparse
 from contextlib import closing
 from pathlib import Path
 
-from dlo_calibration.calibration.engines import SimulatorFactory
+from dlo_calibration.calibration.engines import obstacles_of, SimulatorFactory
 from dlo_calibration.cli.arguments import add_source, read_result_file, selected
 from dlo_calibration.cli.output import print_json, print_message
 from dlo_calibration.errors import InputError
@@ -44,14 +44,15 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     names = {trial.name for trial in trials}
     numbers = [number for number, trial in zip(source.numbers, source.trials, strict=True)
                if trial.name in names]
+    obstacles = obstacles_of(source.options)
     pictures = write_pictures(trials, None if result is None else result.chains, chosen.output,
-                              print_message, numbers)
+                              print_message, numbers, obstacles)
     animations: list[Path] = []
     if chosen.animation and result is not None:
         physical = result.space.physical(result.values, result.length)
         with closing(make_simulator(source.options)) as simulator:
             animations = write_animations(result.trials, simulator, physical, chosen.output,
-                                          print_message, numbers)
+                                          print_message, numbers, obstacles)
     if chosen.json:
         print_json({'pictures': [str(path) for path in pictures],
                     'animations': [str(path) for path in animations]})

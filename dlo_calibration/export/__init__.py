@@ -9,7 +9,7 @@ The calibrated DLO for other simulators, as the text of a file.
 
 from dlo_calibration.export.mjcf import export_mjcf
 from dlo_calibration.export.rope import ExportedRope
-from dlo_calibration.export.sdf import export_sdf
+from dlo_calibration.export.sdf import export_sdf, sdf_meshes
 from dlo_calibration.export.usd import export_usd
 
-__all__ = ['ExportedRope', 'export_mjcf', 'export_sdf', 'export_usd']
+__all__ = ['ExportedRope', 'export_mjcf', 'export_sdf', 'export_usd', 'sdf_meshes']

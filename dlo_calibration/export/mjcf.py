@@ -25,13 +25,16 @@ from scipy.spatial.transform import Rotation
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError, one_of
+from dlo_calibration.export.bodies import COLOUR, corners_and_faces
 from dlo_calibration.export.rope import ExportedRope
 from dlo_calibration.files.xml import add, add_comment, document, new_root
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.parameters import interval, measured
 from dlo_calibration.planning.dlo import CalibratedDlo
+from dlo_calibration.simulation.scene import Obstacle
 
 NAME = 'dlo'  # begins the names of bodies, joints, geoms and sites
+OBSTACLE = 'obstacle'  # begins the names of those of a scene
 FORMS = ('extensible', 'inextensible')
 MOST_NODES = 400  # MuJoCo reads elements that are nested up to 500 deep
 TIME_STEP = 0.002  # s
@@ -39,6 +42,7 @@ TIME_STEP = 0.002  # s
 #: The DLO is to slide, as in the calibration.  In the elliptic cone, a ratio c of rolling leaves sliding
 #: ``1 / sqrt(1 + 1 / c^2)`` of its friction.
 TURNING, ROLLING = 0.01, 4.0
+SOLREF = '0.004 1'  # s and damping ratio, of the contact of the DLO
 #: How much harder friction is than the contact itself.  At MuJoCo's 1, a DLO that is held up creeps.
 HARDNESS = 10
 LEAST_DAMPING = 0.6  # time steps, of the damping relative to the stiffness
@@ -52,7 +56,8 @@ def export_mjcf(dlo: CalibratedDlo, chain: Chain, *, form: str = FORMS[0],
     :param dlo: a `CalibrationResult`, or the `Description` that `read_result` returns.
     :param form: extensible: with the calibrated EA; inextensible: faster, for a DLO that nothing stretches.
     :param options: see `ExportedRope.of`.
-    :raises InputError: if the form is unknown, or there are too many points or nodes.
+    :raises InputError: if the form is unknown, there are too many points or nodes, or the scene cannot be
+        read.
     """
     rope = ExportedRope.of(dlo, chain, options)
     if form not in FORMS:
@@ -80,16 +85,23 @@ class _MjcfWriter:
         add_comment(root, self._about())
         add(root, 'option', timestep=TIME_STEP, integrator='implicitfast', cone='elliptic', impratio=HARDNESS,
             viscosity=_text(self._viscosity()))
-        group = add(add(root, 'default'), 'default', **{'class': NAME})
+        defaults = add(root, 'default')
+        group = add(defaults, 'default', **{'class': NAME})
         add(group, 'geom', type='capsule', size=_text(rope.radius), priority=1, condim=6,
-            friction=_text(rope.friction * np.array([1, TURNING * rope.radius, ROLLING * rope.radius])),
-            solref='0.004 1', rgba='0.9 0.6 0.2 1')
+            friction=self._friction(1.0), solref=SOLREF, rgba='0.9 0.6 0.2 1')
         add(group, 'site', size=_text(1.1 * rope.radius), group=4)
+        if rope.obstacles:
+            group = add(defaults, 'default', **{'class': OBSTACLE})
+            # Above the priority of the DLO, so that the friction of both counts, not that of the DLO alone.
+            add(group, 'geom', priority=2, condim=6, solref=SOLREF, rgba=_text([*COLOUR, 1]))
+            self._meshes(add(root, 'asset'))
         world = add(root, 'worldbody')
         add(world, 'light', pos='0 0 2', dir='0 0 -1', directional='true')
         if rope.table is not None:
             add(world, 'geom', name='table', type='plane', size='0 0 0.1', pos=_text([0, 0, rope.table]),
                 friction=_text([1, 0, 0]), rgba='0.5 0.5 0.5 1')
+        for number, obstacle in enumerate(rope.obstacles):
+            self._obstacle(world, number, obstacle)
         parent = world
         for k in range(len(rope.rest_lengths)):
             parent = self._segment(parent, k)
@@ -99,6 +111,30 @@ class _MjcfWriter:
                 add(contact, 'exclude', body1=f'{NAME}_{k}', body2=f'{NAME}_{other}')
         add(add(root, 'keyframe'), 'key', name='start', qpos=_text(self._start()))
         return root
+
+    def _friction(self, share: float) -> str:
+        """Return the friction of the DLO with a body, whose coefficient is `share`."""
+        radius = self._rope.radius
+        return _text(share * self._rope.friction * np.array([1, TURNING * radius, ROLLING * radius]))
+
+    def _meshes(self, assets: Any) -> None:
+        for number, obstacle in enumerate(self._rope.obstacles):
+            if obstacle.shape == 'mesh':
+                corners, faces = corners_and_faces(obstacle)
+                add(assets, 'mesh', name=f'{OBSTACLE}_{number}', vertex=_text(corners.ravel()),
+                    face=' '.join(map(str, faces.ravel().tolist())))
+
+    def _obstacle(self, world: Any, number: int, obstacle: Obstacle) -> None:
+        name, shape = f'{OBSTACLE}_{number}', obstacle.shape
+        if shape == 'mesh':
+            size = None
+        elif shape == 'box':
+            size = _text(obstacle.sizes / 2)
+        else:  # the radius, and half the length
+            size = _text((obstacle.sizes * [0.5, 1.0][-len(obstacle.sizes):])[::-1])
+        add(world, 'geom', name=name, **{'class': OBSTACLE}, type=shape, mesh=None if size else name,
+            size=size, pos=_text(obstacle.position), quat=_text(np.roll(obstacle.turn, 1)),
+            friction=self._friction(obstacle.friction))
 
     def _segment(self, parent: Any, k: int) -> Any:
         """Add the body of a segment to that of the one before, or the first to the world; return it."""
@@ -199,6 +235,8 @@ class _MjcfWriter:
         if rope.bending_friction > 0:
             lines.append(f'bends that stay: friction between strands of {rope.bending_friction:.3g} 1/m '
                          f'times EI, which slip at {rope.bending_slip:.3g} 1/m')
+        if any(obstacle.shape == 'mesh' for obstacle in rope.obstacles):
+            lines.append('dents and holes of meshes among the obstacles: MuJoCo touches their convex hulls')
         if rope.clamp_twist:
             lines.append(f'the angle of the second clamp, {rope.clamp_twist:.3g} rad')
         return lines

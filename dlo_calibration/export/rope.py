@@ -12,6 +12,7 @@ from typing import Mapping
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from dlo_calibration.calibration.engines import obstacles_of
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.result import ParameterEstimate
 from dlo_calibration.inference.uncertainty import NOT_IDENTIFIABLE
@@ -21,6 +22,7 @@ from dlo_calibration.observation.noise import NO_NOISE, noise_of, smooth
 from dlo_calibration.observation.table import lying_level, rest_on
 from dlo_calibration.planning.dlo import CalibratedDlo
 from dlo_calibration.simulation.nodes import feature_shares, spread_places
+from dlo_calibration.simulation.scene import Obstacle
 
 LEVEL_TOLERANCE = 1e-3  # m; a table that is moved by less is not worth a warning
 LENGTH_TOLERANCE = 0.05  # of the length; a chain that differs by more may belong to another DLO
@@ -50,6 +52,7 @@ class ExportedRope:
     :param bending_friction: largest moment of friction between strands, relative to EI [1/m]; 0: none.
     :param bending_slip: change of curvature at which they slip [1/m].
     :param table: height of the table [m]; None: there is none.
+    :param obstacles: of the scene.
     :param point_places: (m,) arc lengths of the points of the chain at rest [m], from 0.
     :param values: a line for each found parameter: value, 90 % interval, verdict.
     :param warnings: which parameters the trials do not determine, and what was assumed.
@@ -72,6 +75,7 @@ class ExportedRope:
     bending_friction: float
     bending_slip: float
     table: float | None
+    obstacles: tuple[Obstacle, ...]
     point_places: Floats
     values: tuple[str, ...]
     warnings: tuple[str, ...]
@@ -118,13 +122,15 @@ class ExportedRope:
         Return a calibrated DLO at an observed chain.
 
         :param dlo: a `CalibrationResult`, or the `Description` that `read_result` returns.
-        :param options: `nodes`, `table` and `table_height` are used; None: the defaults.
+        :param options: `nodes`, `table`, `table_height` and `scene` are used; None: the defaults.
+        :raises InputError: if the scene cannot be read.
         """
         options = options or Options()
         physical = dlo.space.physical({name: estimate.value for name, estimate in dlo.parameters.items()},
                                         dlo.length)
         radius, twisting = physical['self_collision'], physical.get('torsion', 0.0)
-        level = lying_level(chain, options.table_height) if options.table else None
+        # In a scene, a DLO that lies flat may lie on an obstacle: that says nothing about the table.
+        level = lying_level(chain, options.table_height) if options.table and not options.scene else None
         chain = _without_noise(chain)
         places = spread_places(np.array([0.0, chain.length]), options.nodes)
         points = chain.resample(places)
@@ -148,6 +154,7 @@ class ExportedRope:
             bending_friction=physical.get('bending_friction', 0.0),
             bending_slip=physical.get('bending_slip', 0.0),
             table=None if not options.table else options.table_height if level is None else level - radius,
+            obstacles=obstacles_of(options),
             point_places=frozen_array(chain.arc_lengths() * lengths.sum() / places[-1]),
             values=_values(dlo),
             warnings=(*_undetermined(dlo), *_assumed(dlo, physical, chain),

@@ -15,17 +15,21 @@ until it is straight.  (And in Gazebo Fortress, a lying capsule sinks into a box
 
 from __future__ import annotations
 
+from hashlib import sha256
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from dlo_calibration.calibration.engines import obstacles_of
 from dlo_calibration.calibration.options import Options
+from dlo_calibration.export.bodies import COLOUR, corners_and_faces
 from dlo_calibration.export.rope import ExportedRope
 from dlo_calibration.files.xml import add, add_comment, document, new_root
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.parameters import measured
 from dlo_calibration.planning.dlo import CalibratedDlo
+from dlo_calibration.simulation.scene import Obstacle, SIZES
 
 NAME = 'dlo'  # begins the names of links, joints and frames
 VERSION = '1.9'  # Gazebo Fortress and later
@@ -35,8 +39,11 @@ def export_sdf(dlo: CalibratedDlo, chain: Chain, *, options: Options | None = No
     """
     Return a calibrated DLO at an observed chain as the text of an SDF model.
 
+    Meshes of a scene are files beside it, see `sdf_meshes`.
+
     :param dlo: a `CalibrationResult`, or the `Description` that `read_result` returns.
     :param options: see `ExportedRope.of`.
+    :raises InputError: if the scene cannot be read.
     """
     rope = ExportedRope.of(dlo, chain, options)
     root = new_root('sdf', version=VERSION)
@@ -54,7 +61,67 @@ def export_sdf(dlo: CalibratedDlo, chain: Chain, *, options: Options | None = No
         segment, along = rope.place_of(place)
         frame = add(model, 'frame', name=f'{NAME}_point_{point}', attached_to=f'{NAME}_{segment}')
         _add(frame, 'pose', [along, 0, 0, 0, 0, 0])
+    if rope.obstacles:
+        _add_obstacles(model, rope)
     return document(root).decode()
+
+
+def sdf_meshes(options: Options) -> dict[str, bytes]:
+    """
+    Return the files that an SDF model with these options needs beside it: name -> content.
+
+    They hold the meshes of the scene.  A name follows from the content.
+
+    :raises InputError: if the scene cannot be read.
+    """
+    return dict(_mesh_file(obstacle) for obstacle in obstacles_of(options)
+                if obstacle.shape == 'mesh')
+
+
+def _mesh_file(obstacle: Obstacle) -> tuple[str, bytes]:
+    """Return the name and the content of the file of a mesh, which is scaled."""
+    corners, faces = corners_and_faces(obstacle)
+    lines = [*('v ' + ' '.join(f'{value:.9g}' for value in corner) for corner in corners.tolist()),
+             *('f ' + ' '.join(map(str, face)) for face in (faces + 1).tolist()), '']
+    content = '\n'.join(lines).encode()
+    return f'mesh_{sha256(content).hexdigest()[:12]}.obj', content  # Drake reads .obj, but no .stl
+
+
+def _add_obstacles(model: Any, rope: ExportedRope) -> None:
+    """
+    Add a static model with a link for each obstacle.
+
+    A model of their own, as links of the DLO's model do not touch each other where `self_collide` is false.
+    """
+    obstacles = add(model, 'model', name='obstacles')
+    _add(obstacles, 'static', 'true')
+    for number, obstacle in enumerate(rope.obstacles):
+        link = add(obstacles, 'link', name=f'obstacle_{number}')
+        _add(link, 'pose', [*obstacle.position, *obstacle.turn]).set('rotation_format', 'quat_xyzw')
+        collision = add(link, 'collision', name='collision')
+        _add_shape(collision, obstacle)
+        _add_friction(collision, rope.friction * obstacle.friction)
+        visual = add(link, 'visual', name='visual')
+        _add_shape(visual, obstacle)
+        _add(add(visual, 'material'), 'diffuse', [*COLOUR, 1])
+
+
+def _add_shape(parent: Any, obstacle: Obstacle) -> None:
+    shape = add(add(parent, 'geometry'), obstacle.shape)
+    if obstacle.shape == 'mesh':
+        _add(shape, 'uri', _mesh_file(obstacle)[0])
+        return
+    for name, value in zip(SIZES[obstacle.shape], [obstacle.sizes] if obstacle.shape == 'box'
+                           else obstacle.sizes.tolist(), strict=True):
+        _add(shape, name, value)
+
+
+def _add_friction(collision: Any, coefficient: float) -> None:
+    friction = add(add(collision, 'surface'), 'friction')
+    for engine, names in (('ode', ('mu', 'mu2')), ('bullet', ('friction', 'friction2'))):
+        surface = add(friction, engine)
+        for name in names:
+            _add(surface, name, coefficient)
 
 
 def _add_link(model: Any, rope: ExportedRope, segment: int, start: Floats) -> None:
@@ -67,11 +134,7 @@ def _add_link(model: Any, rope: ExportedRope, segment: int, start: Floats) -> No
     collision = add(link, 'collision', name='collision')
     _add(collision, 'pose', [length / 2, 0, 0, 0, 0, 0])
     _add(add(add(collision, 'geometry'), 'box'), 'size', [length, 2 * rope.radius, 2 * rope.radius])
-    friction = add(add(collision, 'surface'), 'friction')
-    for engine, names in (('ode', ('mu', 'mu2')), ('bullet', ('friction', 'friction2'))):
-        surface = add(friction, engine)
-        for name in names:
-            _add(surface, name, rope.friction)
+    _add_friction(collision, rope.friction)
     visual = add(link, 'visual', name='visual')
     _add(visual, 'pose', [length / 2, 0, 0, 0, np.pi / 2, 0])
     capsule = add(add(visual, 'geometry'), 'capsule')
@@ -151,6 +214,9 @@ def _about(rope: ExportedRope) -> list[str]:
         'collide as boxes, as the physics engine DART has no friction against rolling.']
     if rope.bending_friction > 0:
         lines.append('Not kept: friction between the strands, bending_friction.')
+    if any(obstacle.friction > 1 for obstacle in rope.obstacles):
+        lines.append('Not kept: obstacles with a friction above 1, as DART takes the smaller coefficient of '
+                     'two bodies, here that of the DLO.')
     if not rope.slender:
         lines.append('The segments are shorter than the DLO is thick: self_collide is false, as links that '
                      'are near each other along the DLO would push each other away. Fewer nodes allow it.')

@@ -18,13 +18,16 @@ import numpy as np
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError, one_of
+from dlo_calibration.export.bodies import COLOUR, corners_and_faces
 from dlo_calibration.export.rope import ExportedRope
 from dlo_calibration.files.xml import text_of
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.parameters import measured
 from dlo_calibration.planning.dlo import CalibratedDlo
+from dlo_calibration.simulation.scene import Obstacle
 
 NAME = 'dlo'
+SCENE = 'scene'  # holds the DLO and the obstacles, if there are any
 FORMS = ('newton-1.6', 'newton-1.4')
 
 
@@ -37,28 +40,74 @@ def export_usd(dlo: CalibratedDlo, chain: Chain, *, form: str = FORMS[0],
     :param form: newton-1.6: stiffnesses EA, EI and GJ, for Newton 1.6 and later and Isaac Lab 3.0;
         newton-1.4: the moduli of a round cross-section that has them, for Newton 1.4 and 1.5.
     :param options: see `ExportedRope.of`.
-    :raises InputError: if the form is unknown.
+    :raises InputError: if the form is unknown, or the scene cannot be read.
     """
     if form not in FORMS:
         raise InputError('form', repr(form), one_of(FORMS, form), 'correct it')
     rope = ExportedRope.of(dlo, chain, options)
     moduli = form == FORMS[1]
     curve = [*_shape(rope), *([] if moduli else _thickness(rope)), *_rest(rope, moduli), *_masses(rope),
-             f'rel material:binding:physics = </{NAME}/material>']
+             f'rel material:binding:physics = <{f"/{SCENE}" if rope.obstacles else ""}/{NAME}/material>']
     if not rope.slender:
         curve.append('bool newton:selfCollisionEnabled = 0')
     schemas = ['PhysicsMaterialAPI', 'PhysicsCurvesDeformableMaterialAPI',
                *([] if moduli else ['NewtonCurvesDeformableMaterialAPI'])]
+    prims = _prim('Xform', NAME, ['PhysicsDeformableBodyAPI'], [
+        *_prim('BasisCurves', 'curve', ['PhysicsCurvesDeformableSimAPI', 'PhysicsCollisionAPI',
+                                        'MaterialBindingAPI'], curve),
+        '', *_prim('Material', 'material', schemas, [
+            *(_moduli(rope) if moduli else _stiffnesses(rope)), *_friction(rope.friction)])])
+    if rope.obstacles:  # a layer that is referenced gives only one prim, so that there must be one for all
+        prims = _prim('Xform', SCENE, [], [*prims, '', *_prim('Xform', 'obstacles', [], [
+            line for number, obstacle in enumerate(rope.obstacles)
+            for line in _obstacle(number, obstacle, rope.friction)])])
     return '\n'.join([
-        '#usda 1.0', '(', f'    doc = {_quoted(_about(rope, moduli))}', f'    defaultPrim = "{NAME}"',
-        '    metersPerUnit = 1', '    kilogramsPerUnit = 1', '    upAxis = "Z"', ')', '',
-        *_prim('Xform', NAME, ['PhysicsDeformableBodyAPI'], [
-            *_prim('BasisCurves', 'curve', ['PhysicsCurvesDeformableSimAPI', 'PhysicsCollisionAPI',
-                                            'MaterialBindingAPI'], curve),
-            '', *_prim('Material', 'material', schemas, [
-                *(_moduli(rope) if moduli else _stiffnesses(rope)),
-                *(f'float physics:{name}Friction = {_number(rope.friction)}'
-                  for name in ('static', 'dynamic'))])]), ''])
+        '#usda 1.0', '(', f'    doc = {_quoted(_about(rope, moduli))}',
+        f'    defaultPrim = "{SCENE if rope.obstacles else NAME}"', '    metersPerUnit = 1',
+        '    kilogramsPerUnit = 1', '    upAxis = "Z"', ')', '', *prims, ''])
+
+
+def _obstacle(number: int, obstacle: Obstacle, friction: float) -> list[str]:
+    """
+    Return an obstacle, which does not move, with its material.
+
+    :param friction: of the DLO.
+    """
+    x, y, z, w = obstacle.turn.tolist()
+    place = [f'double3 xformOp:translate = ({", ".join(map(repr, obstacle.position.tolist()))})',
+             f'quatf xformOp:orient = ({", ".join(map(_number, (w, x, y, z)))})']
+    operations, schemas = ['translate', 'orient'], ['PhysicsCollisionAPI', 'MaterialBindingAPI']
+    sizes = obstacle.sizes.tolist()
+    if obstacle.shape == 'box':
+        kind, shape = 'Cube', ['double size = 1']
+        place.append(f'float3 xformOp:scale = ({", ".join(map(_number, sizes))})')
+        operations.append('scale')
+    elif obstacle.shape == 'mesh':
+        kind, (corners, faces) = 'Mesh', corners_and_faces(obstacle)
+        schemas.append('PhysicsMeshCollisionAPI')
+        shape = [f'point3f[] points = {_vectors(corners)}',
+                 f'int[] faceVertexCounts = [{", ".join(["3"] * len(faces))}]',
+                 f'int[] faceVertexIndices = [{", ".join(map(str, faces.ravel().tolist()))}]',
+                 'uniform token subdivisionScheme = "none"',
+                 'uniform token physics:approximation = "none"']
+    elif obstacle.shape == 'sphere':
+        kind, shape = 'Sphere', [f'double radius = {sizes[0]!r}']
+    else:
+        kind, shape = obstacle.shape.capitalize(), [
+            'uniform token axis = "Z"', f'double height = {sizes[0]!r}', f'double radius = {sizes[1]!r}']
+    order = ', '.join(f'"xformOp:{name}"' for name in operations)
+    # The geometric mean with the friction of the DLO is the product of both.
+    material = _friction(friction * obstacle.friction**2)
+    name = f'obstacle_{number}'
+    return [*_prim(kind, name, schemas, [
+        *shape, *place, f'uniform token[] xformOpOrder = [{order}]',
+        f'color3f[] primvars:displayColor = [({", ".join(map(_number, COLOUR))})]',
+        f'rel material:binding:physics = </{SCENE}/obstacles/{name}_material>']),
+        '', *_prim('Material', f'{name}_material', ['PhysicsMaterialAPI'], material), '']
+
+
+def _friction(coefficient: float) -> list[str]:
+    return [f'float physics:{name}Friction = {_number(coefficient)}' for name in ('static', 'dynamic')]
 
 
 def _shape(rope: ExportedRope) -> list[str]:
@@ -173,8 +222,9 @@ def _about(rope: ExportedRope, moduli: bool) -> list[str]:
 def _prim(kind: str, name: str, schemas: list[str], content: list[str]) -> list[str]:
     """Return the lines of a prim with applied schemas."""
     names = ', '.join(f'"{schema}"' for schema in schemas)
-    return [f'def {kind} "{name}" (',
-            f'    prepend apiSchemas = [{names}]', ')', '{',
+    applied = [f'def {kind} "{name}" (', f'    prepend apiSchemas = [{names}]', ')'] if schemas else [
+        f'def {kind} "{name}"']
+    return [*applied, '{',
             *(f'    {line}' if line else '' for line in content), '}']
 
 

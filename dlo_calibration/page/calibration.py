@@ -77,6 +77,16 @@ class ProjectCalibration:
         """Whether a calibration is under way."""
         return self.state == CALIBRATING
 
+    def require_idle(self) -> None:
+        """
+        Check that a calibration can begin.
+
+        :raises InputError: if another one is under way, or its files are being written.
+        """
+        if self.busy or (self._writing is not None and self._writing.is_alive()):
+            raise InputError('calibration', 'another one', 'one at a time',
+                             'stop the other one, or wait until its files are written')
+
     def start(self, session: Path, digest: str) -> None:
         """
         Begin to calibrate.
@@ -85,9 +95,7 @@ class ProjectCalibration:
         :param digest: of the trials, which shows whether they change afterwards.
         :raises InputError: if another one is under way, or the session cannot be used.
         """
-        if self.busy or (self._writing is not None and self._writing.is_alive()):
-            raise InputError('calibration', 'another one', 'one at a time',
-                             'stop the other one, or wait until its files are written')
+        self.require_idle()
         warnings: list[str] = []
         source = read_source(Selection(session, self._machine), warnings.append).require_trials()
         with ExitStack() as stack:

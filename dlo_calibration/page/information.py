@@ -27,14 +27,19 @@ class Information:
     def __init__(self, make_simulator: SimulatorFactory) -> None:
         self._appraiser = LiveInformation(make_simulator)
         self._wanted: tuple[tuple[Trial, ...], Options] = ((), Options())
+        self._scene = ''
         self._appraised: tuple[object, ...] = ()  # key of the last appraisal
         self._changed = time.monotonic()
         self._entries: dict[str, dict[str, Any]] = {}  # by the name of the trial
 
-    def want(self, trials: Sequence[Trial], options: Options) -> None:
-        """Set the trials to appraise; each has a name of its own."""
-        if _key(trials, options) != _key(*self._wanted):
-            self._wanted, self._changed = (tuple(trials), options), time.monotonic()
+    def want(self, trials: Sequence[Trial], options: Options, scene: str = '') -> None:
+        """
+        Set the trials to appraise; each has a name of its own.
+
+        :param scene: digest of the obstacles in the scene of the options.
+        """
+        if _key(trials, options, scene) != _key(*self._wanted, self._scene):
+            self._wanted, self._scene, self._changed = (tuple(trials), options), scene, time.monotonic()
 
     def pause(self) -> None:
         """Stop the appraisal, to leave the processor to a calibration; `take` starts it again."""
@@ -44,7 +49,7 @@ class Information:
 
     def take(self) -> bool:
         """Begin to appraise new trials; return whether information has arrived since the last call."""
-        key = _key(*self._wanted)
+        key = _key(*self._wanted, self._scene)
         if key != self._appraised and time.monotonic() - self._changed > QUIET:
             if key[:len(self._appraised)] != self._appraised:  # more than new trials at the end
                 self._appraiser.stop()
@@ -72,5 +77,5 @@ class Information:
         self._appraiser.join(1.0)
 
 
-def _key(trials: Sequence[Trial], options: Options) -> tuple[object, ...]:
-    return (repr(options), *zip((trial.name for trial in trials), fingerprints(trials), strict=True))
+def _key(trials: Sequence[Trial], options: Options, scene: str) -> tuple[object, ...]:
+    return ((repr(options), scene), *zip((trial.name for trial in trials), fingerprints(trials), strict=True))

@@ -28,8 +28,8 @@ from dlo_calibration.vision.board import board_document
 
 PAGE = Path(__file__).parent / 'static'
 TYPES = {'.html': 'text/html', '.css': 'text/css', '.js': 'text/javascript', '.svg': 'image/svg+xml',
-         '.png': 'image/png', '.xml': 'application/xml', '.csv': 'text/csv', '.pdf': 'application/pdf',
-         '.mcap': 'application/octet-stream'}
+         '.png': 'image/png', '.xml': 'application/xml', '.urdf': 'application/xml', '.csv': 'text/csv',
+         '.pdf': 'application/pdf', '.mcap': 'application/octet-stream'}
 LARGEST_PHOTOGRAPH = 64 * 2**20  # bytes
 LARGEST_TEXT = 2 * 2**20  # bytes of anything else
 TICK = 0.2  # s between two checks of the background work

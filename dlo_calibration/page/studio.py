@@ -14,7 +14,8 @@ from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.capture.document import Document
 from dlo_calibration.capture.hands import described
-from dlo_calibration.capture.project import Project
+from dlo_calibration.capture.obstacles import scene_document
+from dlo_calibration.capture.project import Project, SCENE
 from dlo_calibration.capture.trials import Drafter, Drafts, write_request, write_session
 from dlo_calibration.errors import InputError, suggestion
 from dlo_calibration.evaluation.digest import digest
@@ -27,6 +28,7 @@ from dlo_calibration.page.information import Information
 from dlo_calibration.simulation.motion import Motion
 from dlo_calibration.vision.photograph import jpeg, png
 from dlo_calibration.workspace.folder import FILES, REQUEST, SESSION
+from dlo_calibration.writing import make_folder, write_file
 
 MOST_FILMS = 8  # in memory
 CHAIN_FILES = {'csv': chain_csv, 'xml': chain_xml}
@@ -66,7 +68,7 @@ class Studio:
             trials = [{**trial, 'information': self._information.plain(_name(k))}
                       for k, trial in enumerate(drafts['trials'])]
             return {'revision': self.project.revision, 'document': self.project.document.plain(),
-                    'photographs': drafts['photographs'], 'trials': trials,
+                    'photographs': drafts['photographs'], 'trials': trials, 'obstacles': drafts['obstacles'],
                     'calibration': {**self.calibration(),
                                     'result': self._calibration.plain_result(self._drafts.digest)},
                     'lens': self.project.lens_name, 'ros': self._graph is not None,
@@ -127,7 +129,9 @@ class Studio:
                 raise InputError('calibration', f'an option {unknown[0]!r}', 'evaluations or seed',
                                  suggestion(unknown[0], ('evaluations', 'seed'), 'leave it out'))
             self._calibration.take()
-            path = self._write(SESSION, given)
+            self._calibration.require_idle()
+            # A scene of its own: the person may change the obstacles while it goes on.
+            path = self._write(SESSION, {**given, **self._write_scene(self._calibration.folder)})
             self._information.pause()
             self._calibration.start(path, self._drafts.digest)
             return self.state()
@@ -178,6 +182,11 @@ class Studio:
         with self._lock:
             if name in (SESSION, REQUEST):
                 return self._saved(name).read_bytes()
+            if name == SCENE:
+                if not self._drafts.placed:
+                    raise InputError(name, 'no obstacle yet', 'an obstacle', 'add one in the step Scale')
+                self._write_scene(self.project.folder)
+                return (self.project.folder / SCENE).read_bytes()
             if name in FILES:
                 if name not in self._calibration.files:
                     raise InputError(name, 'no such file yet', 'a result', 'calibrate first')
@@ -259,7 +268,9 @@ class Studio:
         if self._newest is None:
             self._newest = self._drafter.draft()
             trials = [draft.trial for draft in self._newest.trials if draft.trial is not None]
-            self._information.want(trials, self._options({}))
+            with suppress(InputError):  # a calibration is refused with the reason
+                self._write_scene(self.project.folder)
+            self._information.want(trials, self._options({}), digest(*self._newest.obstacles))
         return self._newest
 
     def _complete(self) -> tuple[Trial, ...]:
@@ -272,6 +283,7 @@ class Studio:
 
     def _write(self, name: str, given: Mapping[str, Any]) -> Path:
         """Write the session or request of the trials as they are now; return its path."""
+        self._write_scene(self.project.folder)
         path, write = self.project.folder / name, write_session if name == SESSION else write_request
         write(path, self._complete(), self._options(given).flat())
         return path
@@ -284,7 +296,23 @@ class Studio:
         return self._write(name, options)
 
     def _options(self, given: Mapping[str, Any]) -> Options:
-        return Options.of({**self._drafts.options, **self._given_options, **given})
+        scene = {'scene': _scene(self.project.folder)} if self._drafts.placed else {}
+        return Options.of({**self._drafts.options, **scene, **self._given_options, **given})
+
+    def _write_scene(self, folder: Path) -> dict[str, str]:
+        """
+        Write the obstacles, if there are any, to a folder; return the option that names the file.
+
+        :raises InputError: if one of them cannot be placed, or the file cannot be written.
+        """
+        for placed in self._drafts.placed:
+            if isinstance(placed, InputError):
+                raise placed
+        if not self._drafts.placed:
+            return {}
+        make_folder(folder)
+        write_file(folder / SCENE, scene_document(self._drafts.obstacles))
+        return {'scene': _scene(folder)}
 
     def _checked(self, identity: str) -> str:
         """
@@ -302,6 +330,10 @@ class Studio:
             raise InputError('ROS', 'no ROS 2 here', 'an installation of ROS 2 that is sourced',
                              'source it and start the page again')
         return self._graph
+
+
+def _scene(folder: Path) -> str:
+    return str((folder / SCENE).resolve())
 
 
 def _name(number: int) -> str:

@@ -21,6 +21,7 @@ from dlo_calibration.report.drawing import hand_colours, View, write_numbered
 from dlo_calibration.report.figure import add_legend, as_text, blank_figure, OBSERVED, settings, SIMULATED
 from dlo_calibration.simulation.motion import FRAME_RATE, hands_at, Motion, simulated_motion
 from dlo_calibration.simulation.protocol import Simulator
+from dlo_calibration.simulation.scene import Obstacle
 from dlo_calibration.writing import whole
 
 DOTS_PER_INCH = 80  # enough to read the legend; more makes a large file
@@ -43,17 +44,18 @@ class Captions:
 
 
 def write_animation(trial: Trial, motion: Motion, path: str | Path,
-                    captions: Captions | None = None) -> None:
+                    captions: Captions | None = None, obstacles: Sequence[Obstacle] = ()) -> None:
     """
     Write a GIF with the simulated motion and the goal, from above (left) and from the side (right).
 
     :param captions: None: the chains of the trial were measured.
+    :param obstacles: of the scene.
     :raises InputError: if the file cannot be written.
     """
     speed = max(1.0, (motion.times[-1] - motion.times[0]) * FRAME_RATE / max(len(motion.times) - 1, 1))
     captions = captions or Captions(f'{trial.name}, simulated')
     with settings():
-        scene = _Scene(trial, motion, speed, captions)
+        scene = _Scene(trial, motion, speed, captions, obstacles)
         frames = [scene.frame(float(time), chain, f't = {time:.2f} s')  # of constant width
                   for time, chain in zip(motion.times, motion.chains, strict=True)]
         frames.append(scene.frame(float(motion.times[-1]), motion.ends[-1], 'at the end'))
@@ -66,7 +68,8 @@ def write_animation(trial: Trial, motion: Motion, path: str | Path,
 
 
 def write_animations(trials: Sequence[Trial], simulator: Simulator, physical: Mapping[str, float],
-                     folder: Path, note: Callable[[str], None], numbers: Sequence[int]) -> list[Path]:
+                     folder: Path, note: Callable[[str], None], numbers: Sequence[int],
+                     obstacles: Sequence[Obstacle] = ()) -> list[Path]:
     """
     Simulate trials and write ``trial_1.gif``, ``trial_2.gif``, ... into a folder, which is created.
 
@@ -77,7 +80,7 @@ def write_animations(trials: Sequence[Trial], simulator: Simulator, physical: Ma
     :raises SimulationError: if a trial cannot be simulated.
     """
     return write_numbered(
-        (partial(write_animation, trial, simulated_motion(trial, simulator, physical))
+        (partial(write_animation, trial, simulated_motion(trial, simulator, physical), obstacles=obstacles)
          for trial in (with_hands(trial, physical) for trial in trials)),
         folder, '.gif', note, numbers)
 
@@ -89,7 +92,8 @@ class _Scene:
     What does not move is drawn once, as that takes most of the time.
     """
 
-    def __init__(self, trial: Trial, motion: Motion, speed: float, captions: Captions) -> None:
+    def __init__(self, trial: Trial, motion: Motion, speed: float, captions: Captions,
+                 obstacles: Sequence[Obstacle]) -> None:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
 
         self._figure = blank_figure(10.5, 4.8)
@@ -103,7 +107,9 @@ class _Scene:
         self._title = self._figure.suptitle(' ', fontweight='bold')
         axes = self._figure.subplots(1, 2)
         for subplot, above in zip(axes, (True, False), strict=True):
-            self._moving.append(self._prepare(View(subplot, trial, above=above), motion))
+            view = View(subplot, trial, above=above)
+            view.draw_obstacles(obstacles)
+            self._moving.append(self._prepare(view, motion))
         add_legend(self._figure, list(axes), columns=3)
         for artist in self._artists():
             artist.set_animated(True)  # so that `draw` leaves it out

@@ -22,6 +22,8 @@ from dlo_calibration.model.parameters import interval, measured, number
 from dlo_calibration.model.score import differences, MEAN_DISTANCE, PointErrors, residuals
 from dlo_calibration.model.trial import shown_goals, Trial
 from dlo_calibration.report import figure
+from dlo_calibration.report.obstacles import ABOVE, draw_obstacles
+from dlo_calibration.simulation.scene import Obstacle
 from dlo_calibration.writing import Attempts, make_folder
 
 if TYPE_CHECKING:
@@ -44,6 +46,7 @@ class Drawn:
     :param noise: noise level: standard deviation of a measured coordinate [m]; nan if unknown.
     :param band: (n,) standard deviation of the simulated points, the largest of all shown goals [m]; None if
         unknown.
+    :param obstacles: of the scene.
     """
 
     trial: Trial
@@ -51,13 +54,14 @@ class Drawn:
     colours: Mapping[str, str]
     noise: float = math.nan
     band: Floats | None = None
+    obstacles: Sequence[Obstacle] = ()
 
     @classmethod
-    def of(cls, result: CalibrationResult, k: int) -> Drawn:
+    def of(cls, result: CalibrationResult, k: int, obstacles: Sequence[Obstacle] = ()) -> Drawn:
         """Return the k-th trial of a result."""
         trial, examination = result.trials[k], result.examination
         drawn = cls(trial, result.chains[k], hand_colours([trial]),
-                    math.nan if examination is None else examination.noise)
+                    math.nan if examination is None else examination.noise, obstacles=obstacles)
         if result.band is None:
             return drawn
         by_goal = ResidualLayout.of(result.trials).by_point(result.band)[k]
@@ -93,12 +97,14 @@ class Drawn:
         return sorted(chosen)
 
 
-def session_picture(trials: Sequence[Trial], chains: Sequence[Floats] | None, path: str | Path) -> None:
+def session_picture(trials: Sequence[Trial], chains: Sequence[Floats] | None, path: str | Path,
+                    obstacles: Sequence[Obstacle] = ()) -> None:
     """
     Write a PNG with a row per trial: from above, from the side, and the error of each point.
 
     :param chains: of each trial, (g, n, 3) simulated at its goals [m]; None: nothing was simulated, and
         the distance that each point moved is drawn instead of the error.
+    :param obstacles: of the scene.
     :raises InputError: if the file cannot be written.
     """
     colours = hand_colours(trials)
@@ -110,7 +116,7 @@ def session_picture(trials: Sequence[Trial], chains: Sequence[Floats] | None, pa
         rows = whole.subfigures(len(trials), 1, squeeze=False)[:, 0]
         explained: list[Axes] = []
         for k, (trial, row) in enumerate(zip(trials, rows, strict=True)):
-            drawn = Drawn(trial, None if chains is None else chains[k], colours)
+            drawn = Drawn(trial, None if chains is None else chains[k], colours, obstacles=obstacles)
             row.suptitle(figure.as_text(_title(drawn)), fontweight='bold')
             above, side, error = row.subplots(1, 3)
             draw_view(above, drawn, above=True)
@@ -125,7 +131,8 @@ def session_picture(trials: Sequence[Trial], chains: Sequence[Floats] | None, pa
 
 
 def write_pictures(trials: Sequence[Trial], chains: Sequence[Floats] | None, folder: Path,
-                   note: Callable[[str], None], numbers: Sequence[int]) -> list[Path]:
+                   note: Callable[[str], None], numbers: Sequence[int],
+                   obstacles: Sequence[Obstacle] = ()) -> list[Path]:
     """
     Write ``trial_1.png``, ``trial_2.png``, ... into a folder, which is created; see `session_picture`.
 
@@ -134,7 +141,7 @@ def write_pictures(trials: Sequence[Trial], chains: Sequence[Floats] | None, fol
     :raises DloCalibrationError: if files cannot be written; the others are.
     """
     return write_numbered(
-        (partial(session_picture, [trial], None if chains is None else [chains[k]])
+        (partial(session_picture, [trial], None if chains is None else [chains[k]], obstacles=obstacles)
          for k, trial in enumerate(trials)), folder, '.png', note, numbers)
 
 
@@ -201,7 +208,7 @@ class View:
         if extent is None:
             extent = np.concatenate([trial.initial.points, *(goal.chain.points for goal in trial.goals)])
         across = _horizontal_direction(extent)
-        self._projection = np.array([[1.0, 0, 0], [0, 1.0, 0]] if above else [across, [0, 0, 1.0]])
+        self._projection = ABOVE if above else np.array([across, [0, 0, 1.0]])
         if above:
             axes.set(title='seen from above', xlabel='x [m]', ylabel='y [m]')
         else:
@@ -217,6 +224,10 @@ class View:
         """Project (n, 3) points [m] to (2, n) [m]."""
         flat: Floats = self._projection @ np.asarray(points).T
         return flat
+
+    def draw_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
+        """Draw the obstacles of a scene, as far as the axes show them."""
+        draw_obstacles(self.axes, obstacles, self._projection)
 
     def draw_start(self, label: str = 'before the action, measured') -> None:
         """Draw the DLO before the action."""
@@ -282,6 +293,7 @@ class View:
 def draw_view(axes: Axes, drawn: Drawn, *, above: bool) -> None:
     """Draw a trial from one side."""
     view = View(axes, drawn.trial, above=above)
+    view.draw_obstacles(drawn.obstacles)
     view.draw_start()
     for goal, colour in drawn.goals():
         view.draw_goal(goal, None if drawn.chains is None else drawn.chains[goal], colour)

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 #: The palette of Okabe and Ito, which colour-blind people can distinguish (Color Universal Design, 2008).
 BLUE, GREEN, PURPLE, SKY, YELLOW = '#0072b2', '#009e73', '#cc79a7', '#56b4e9', '#e69f00'
 OBSERVED, SIMULATED, BEFORE, FAINT = 'black', '#d55e00', '0.72', '0.45'
+OBSTACLE, EDGE = '#d9d9e0', '#8c8c99'  # of obstacles of a scene
 BAND = '#f7d9c4'  # a light tint of SIMULATED
 WIDTH, HEIGHT = 4.8, 3.5  # in, of a panel of the page: it stays readable on a phone
 MOST_TICKS = 5  # intervals along a panel: of more, long numbers would touch each other

@@ -14,6 +14,7 @@ import platform
 import shlex
 from typing import Any, Mapping, Sequence, TYPE_CHECKING
 
+from dlo_calibration.calibration.engines import obstacles_of
 from dlo_calibration.calibration.options import Options, recordable
 from dlo_calibration.calibration.result import CalibrationResult, plain
 from dlo_calibration.errors import printable
@@ -30,6 +31,7 @@ from dlo_calibration.report.sentences import (
     parameter_rows,
     sentences,
 )
+from dlo_calibration.simulation.scene import Obstacle
 
 if TYPE_CHECKING:
     from jinja2 import Template
@@ -69,6 +71,7 @@ def page_of(result: CalibrationResult, origin: Origin, slices: Slices | None = N
     Return the page, which needs no other file and no network.
 
     :param slices: through the best parameter set; None: the page has none.
+    :raises InputError: if the scene can no longer be read.
     """
     values = plain(result)
     return _template().render(
@@ -78,7 +81,8 @@ def page_of(result: CalibrationResult, origin: Origin, slices: Slices | None = N
         marks={IDENTIFIABLE: 'good', WEAK: 'weak', NOT_IDENTIFIABLE: 'bad', '': ''},  # classes of the style
         similar=SIMILAR, very_similar=VERY_SIMILAR, errors=_errors(result, values), facts=fit_facts(values),
         rest_shapes=rest_shape_panels(result), moments=moment_panels(result),
-        convergence=convergence_panel(result), **_trials(result), lower_score=lower_score(result),
+        convergence=convergence_panel(result), lower_score=lower_score(result),
+        **_trials(result, obstacles_of(origin.options)),
         lines=[] if slices is None else line_panels(result, slices.lines),
         planes=[] if slices is None else [
             (plane.names, plane_panels(result, plane)) for plane in slices.planes],
@@ -123,13 +127,13 @@ def _errors(result: CalibrationResult, values: Mapping[str, Any]) -> dict[str, f
             None if result.band is None else float(result.band.mean())}
 
 
-def _trials(result: CalibrationResult) -> dict[str, Any]:
+def _trials(result: CalibrationResult, obstacles: Sequence[Obstacle]) -> dict[str, Any]:
     """Return a table row for each trial, and by index the drawings of those with the largest errors."""
     errors = [PointErrors.of(residuals(trial, chains))
               for trial, chains in zip(result.trials, result.chains, strict=True)]
     worst = sorted(range(len(errors)), key=lambda k: -errors[k].mean)[:MOST_TRIALS]
     return {'trials': list(zip(result.trials, result.best.scores, errors, strict=True)),
-            'drawn': {k: trial_panels(Drawn.of(result, k)) for k in sorted(worst)}}
+            'drawn': {k: trial_panels(Drawn.of(result, k, obstacles)) for k in sorted(worst)}}
 
 
 def _changed(options: Options) -> dict[str, Any]:

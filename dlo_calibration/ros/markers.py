@@ -5,13 +5,17 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+from itertools import count
+from pathlib import Path
 from typing import Any, Iterator, Sequence
 
 import numpy as np
 
 from dlo_calibration.calibration.result import CalibrationResult
+from dlo_calibration.errors import InputError
 from dlo_calibration.messages.codec import MessageTypes, OUTPUT_TYPES
-from dlo_calibration.model.action import Hand, NO_ROTATION
+from dlo_calibration.model.action import Hand, NO_ROTATION, rotation_matrix
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.parameters import measured
 from dlo_calibration.model.pose import Pose
@@ -19,9 +23,11 @@ from dlo_calibration.model.score import PointErrors, residuals
 from dlo_calibration.model.trial import shown_goals, Trial
 from dlo_calibration.planning.plan import Plan, PlannedAction
 from dlo_calibration.report.drawing import hand_path
+from dlo_calibration.report.obstacles import MOST_TRIANGLES, triangles_of
+from dlo_calibration.simulation.scene import Obstacle, read_scene
 
 # Types and actions of visualization_msgs/Marker.
-CUBE, SPHERE, LINE_STRIP, LINE_LIST, SPHERE_LIST, TEXT = 1, 2, 4, 5, 7, 9
+CUBE, SPHERE, CYLINDER, LINE_STRIP, LINE_LIST, SPHERE_LIST, TEXT, TRIANGLE_LIST = 1, 2, 3, 4, 5, 7, 9, 11
 ADD, DELETE_ALL = 0, 3
 
 MOST_HANDS = 100  # drawn of a trial; a flood gives thousands, and drawing them would delay answers
@@ -30,24 +36,27 @@ MOST_POINTS = 200  # drawn of a chain or path; closer points cannot be distingui
 # Red, green and blue from 0 to 1: they differ in hue, and are bright enough for a dark background.
 Colour = tuple[float, float, float]
 INITIAL_COLOUR, GOAL_COLOUR, SIMULATED_COLOUR = (0.6, 0.6, 0.6), (0.25, 0.6, 1.0), (1.0, 0.55, 0.1)
-TEXT_COLOUR = (0.9, 0.9, 0.9)
+TEXT_COLOUR, OBSTACLE_COLOUR = (0.9, 0.9, 0.9), (0.45, 0.45, 0.55)
 HAND_COLOURS = ((0.2, 0.8, 0.3), (0.75, 0.45, 0.9), (0.75, 0.55, 0.4), (0.95, 0.5, 0.75))
 
 
 def markers(types: MessageTypes, trials: Sequence[Trial], *, stamp: int, frame_id: str,
-            result: CalibrationResult | None = None, pose: Pose | None = None) -> Any:
+            result: CalibrationResult | None = None, pose: Pose | None = None,
+            obstacles: Sequence[Obstacle] = ()) -> Any:
     """
     Build the message that shows trials; it replaces everything that earlier messages show.
 
-    Namespaces are ``trial_1/initial``, ``/goal``, ``/simulated``, ``/error``, ``/hands``, ``/label``.
+    Namespaces are ``trial_1/initial``, ``/goal``, ``/simulated``, ``/error``, ``/hands``, ``/label``, and
+    ``scene/obstacles``.
     An id follows from the index of a goal or a hand, so it is the same in every message.
 
     :param frame_id: of the session.
     :param pose: of that frame in the one of the trials; None: they are the same.
     :param result: its rollouts are shown with those of `trials` that it was calibrated on.
+    :param obstacles: of the scene, in the frame of the trials.
     """
     header, back = types.header(stamp, frame_id), None if pose is None else pose.inverse
-    built = [cleared(types, header)]
+    built = [cleared(types, header), *_obstacle_markers(Brush(types, header, 'scene', 1.0, back), obstacles)]
     simulated = {} if result is None else {
         trial.name: (trial, chains) for trial, chains in zip(result.trials, result.chains, strict=True)}
     for k, trial in enumerate(trials):
@@ -55,6 +64,39 @@ def markers(types: MessageTypes, trials: Sequence[Trial], *, stamp: int, frame_i
         brush = Brush(types, header, f'trial_{k + 1}', 0.01 * trial.initial.length, back)
         built += _trial_markers(brush, trial, chains if _same(trial, of_result) else None, k)
     return types.build(OUTPUT_TYPES['markers'], markers=built)
+
+
+def shown_obstacles(scene: str) -> tuple[Obstacle, ...]:
+    """Return the obstacles in a URDF file; none where it cannot be read, as a request says why."""
+    try:
+        return _read(scene, Path(scene).stat().st_mtime_ns) if scene else ()
+    except (OSError, ValueError, InputError):
+        return ()
+
+
+@lru_cache(1)
+def _read(scene: str, _changed: int) -> tuple[Obstacle, ...]:
+    return read_scene(scene)
+
+
+def _obstacle_markers(brush: Brush, obstacles: Sequence[Obstacle]) -> Iterator[Any]:
+    """Show obstacles; a capsule is a cylinder and two spheres."""
+    numbers = count()
+    for obstacle in obstacles:
+        shape, sizes, position = obstacle.shape, obstacle.sizes, obstacle.position
+        if shape == 'mesh':
+            yield brush.marker('obstacles', next(numbers), TRIANGLE_LIST, group=3, most=3 * MOST_TRIANGLES,
+                               points=triangles_of(obstacle).reshape(-1, 3), colours=[OBSTACLE_COLOUR])
+            continue
+        width = 2 * sizes[-1]
+        bodies = [{'box': (CUBE, position, sizes), 'sphere': (SPHERE, position, np.full(3, width))}.get(
+            shape, (CYLINDER, position, np.array([width, width, sizes[0]])))]
+        if shape == 'capsule':
+            half = rotation_matrix(obstacle.turn)[:, 2] * sizes[0] / 2
+            bodies += [(SPHERE, position + side * half, np.full(3, width)) for side in (-1, 1)]
+        for kind, at, lengths in bodies:
+            yield brush.marker('obstacles', next(numbers), kind, at=at, turn=obstacle.turn, sizes=lengths,
+                               colours=[OBSTACLE_COLOUR])
 
 
 def cleared(types: MessageTypes, header: Any) -> Any:
@@ -170,28 +212,33 @@ class Brush:
         return self.marker(name, number, TEXT, at=at, colours=[TEXT_COLOUR], scale=4.0, text=text)
 
     def marker(self, name: str, number: int, kind: int, *, points: Floats | None = None,
-               at: Floats | None = None, colours: Sequence[Colour] = (TEXT_COLOUR,), scale: float = 1.0,
-               text: str = '', group: int = 1, action: int = ADD) -> Any:
+               at: Floats | None = None, turn: Floats | None = None,
+               colours: Sequence[Colour] = (TEXT_COLOUR,), scale: float = 1.0, sizes: Floats | None = None,
+               text: str = '', group: int = 1, most: int = MOST_POINTS, action: int = ADD) -> Any:
         """
         Build a marker.
 
         :param points: (n, 3) [m] of a list or strip; a long one keeps only some groups of `group` points.
         :param at: (3,) [m] position; None: the origin.
+        :param turn: (4,) orientation, quaternion x y z w; None: none.
         :param colours: one for the whole marker, or one per point.
+        :param sizes: (3,) [m] along x, y and z, instead of `scale`.
+        :param most: largest number of groups.
         """
         build, point = self._types.build, self._types.find('geometry_msgs/msg/Point')
         points = np.zeros((0, 3)) if points is None else points
-        shown = _shown(len(points), group)
+        shown = _shown(len(points), group, most)
         x, y, z = self._pose.points(np.zeros(3) if at is None else at).tolist()
-        turn = dict(zip('xyzw', self._pose.orientation.tolist(), strict=True))
-        size = scale * self.thickness
+        turned = self._pose.orientation if turn is None else self._pose.orientations(turn)
+        lengths = np.full(3, scale * self.thickness) if sizes is None else sizes
         # In `scale`, lines use only x, and texts only z.
         return build(
             'visualization_msgs/msg/Marker', header=self._header, ns=f'{self._prefix}/{name}' if name else '',
             id=number, type=kind, action=action,
             pose=build('geometry_msgs/msg/Pose', position=build('geometry_msgs/msg/Point', x=x, y=y, z=z),
-                       orientation=build('geometry_msgs/msg/Quaternion', **turn)),
-            scale=build('geometry_msgs/msg/Vector3', x=size, y=size, z=size),
+                       orientation=build('geometry_msgs/msg/Quaternion',
+                                         **dict(zip('xyzw', turned.tolist(), strict=True)))),
+            scale=build('geometry_msgs/msg/Vector3', **dict(zip('xyz', lengths.tolist(), strict=True))),
             color=self._colour(colours[0]),
             lifetime=self._lifetime, frame_locked=False,
             points=[point(x=x, y=y, z=z) for x, y, z in points[shown].tolist()],
@@ -204,32 +251,34 @@ class Brush:
         return self._types.build('std_msgs/msg/ColorRGBA', r=red, g=green, b=blue, a=1.0)
 
 
-def _shown(count: int, group: int) -> list[int]:
-    """Return the indices of at most MOST_POINTS groups, evenly spread over `count` points."""
+def _shown(count: int, group: int, most: int) -> list[int]:
+    """Return the indices of at most `most` groups, evenly spread over `count` points."""
     groups = count // group
-    if groups <= MOST_POINTS:
+    if groups <= most:
         return list(range(group * groups))
-    chosen = np.linspace(0, groups - 1, MOST_POINTS).round()
+    chosen = np.linspace(0, groups - 1, most).round()
     return [group * int(k) + i for k in chosen for i in range(group)]
 
 
 def plan_markers(types: MessageTypes, plan: Plan, *, stamp: int, frame_id: str,
-                 pose: Pose | None = None) -> Any:
+                 pose: Pose | None = None, obstacles: Sequence[Obstacle] = ()) -> Any:
     """
     Build the message that shows a plan; it replaces everything that earlier messages show.
 
     Namespaces are ``plan/start``, ``/goal``, ``/label``, and for each action ``action_1/predicted``,
-    ``/interval``, ``/hands``, ``/label``.  The colour of a prediction goes from that of the start to
-    orange.  An interval is a cross at each point: the 90 % intervals of its coordinates.
+    ``/interval``, ``/hands``, ``/label``; and ``scene/obstacles``.  The colour of a prediction goes from that
+    of the start to orange.  An interval is a cross at each point: the 90 % intervals of its coordinates.
 
     :param pose: of the plan's frame in that of `frame_id`; None: they are the same.
+    :param obstacles: of the scene, in the plan's frame.
     """
     header = types.header(stamp, frame_id)
     thickness = 0.01 * plan.start.length
     brush = Brush(types, header, 'plan', thickness, pose)
     title = (f'{len(plan.actions)} action(s): mean error {measured(plan.error_before, "m")} before, '
              f'{measured(plan.error_after, "m")} after')
-    built = [cleared(types, header), brush.line('start', 0, plan.start.points, INITIAL_COLOUR),
+    built = [cleared(types, header), *_obstacle_markers(Brush(types, header, 'scene', 1.0, pose), obstacles),
+             brush.line('start', 0, plan.start.points, INITIAL_COLOUR),
              brush.spheres('goal', 0, plan.goal.points, [GOAL_COLOUR], 1.2),
              brush.line('goal', 1, plan.goal.points, GOAL_COLOUR, 0.5),
              brush.label('label', 0, plan.goal.points[0] + [0.0, 0.0, 6 * thickness], title)]

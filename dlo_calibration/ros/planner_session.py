@@ -28,7 +28,7 @@ from dlo_calibration.planning.plan import plain_plan, Plan
 from dlo_calibration.planning.planner import checked, plan, PlanProgress
 from dlo_calibration.report.sentences import outcome
 from dlo_calibration.ros.diagnostics import DONE, plan_progress, planner_status, PLANNING, WAITING
-from dlo_calibration.ros.markers import plan_markers
+from dlo_calibration.ros.markers import plan_markers, shown_obstacles
 from dlo_calibration.ros.node_session import NodeInterface, NodeSession, NodeState, refusal_text
 from dlo_calibration.workspace.worker import Background, Failure
 
@@ -184,6 +184,7 @@ class PlannerSession(NodeSession[PlannerOptions]):
         self._plan: Plan | None = None
         self._plans, self.planning = 0, False  # whether a plan is under way
         self._frame_id = ''  # of the chains that are planned with
+        self._scene = ''  # that is planned with
         self._back: Pose | None = None  # of the table's frame in that of the chains
         self._report()
 
@@ -279,7 +280,7 @@ class PlannerSession(NodeSession[PlannerOptions]):
         self._background.join()  # it has put its last event, so it ends now
         self._background.begin(work)
         self._state.name, self._state.detail = PLANNING, FIRST
-        self._frame_id, self.planning = start.frame_id, True
+        self._frame_id, self._scene, self.planning = start.frame_id, simulation.scene, True
         self._plan, self._progress, self._plans = None, None, self._plans + 1
         self._back = None if pose is None else pose.inverse
         age = self._clock() - self._newest[CHAIN].came
@@ -319,7 +320,7 @@ class PlannerSession(NodeSession[PlannerOptions]):
         stamp, sent = self._graph.stamp(), plan if self._back is None else plan.moved(self._back)
         self._send(STEPS, self._types.build(OUTPUT_TYPES[STEPS], data=json.dumps(plain_plan(sent))))
         self._send('markers', plan_markers(self._types, plan, stamp=stamp, frame_id=self._frame_id,
-                                           pose=self._back))
+                                           pose=self._back, obstacles=shown_obstacles(self._scene)))
         if plan.actions:
             # With use_sim_time and no /clock, the node's time is 0, which is no stamp of an action.
             message = action_message(sent.actions[0].action.hands, stamp or NANOSECONDS, self._frame_id)

@@ -35,7 +35,7 @@ from dlo_calibration.messages.codec import (
 from dlo_calibration.messages.collector import KEPT, StampOrder, TrialCollector, went_back
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.ros import diagnostics
-from dlo_calibration.ros.markers import alike, markers
+from dlo_calibration.ros.markers import alike, markers, shown_obstacles
 from dlo_calibration.ros.node_session import NodeInterface, NodeSession, NodeState, refusal_text
 from dlo_calibration.ros.recorder import Recorder
 from dlo_calibration.workspace.live_information import LiveInformation
@@ -168,7 +168,8 @@ class Outlet:
     def __init__(self, graph: NodeInterface[Options], types: MessageTypes, recorder: Recorder,
                  clock: Callable[[], float]) -> None:
         self._graph, self._types, self._recorder, self._clock = graph, types, recorder, clock
-        self._shown: tuple[CalibrationResult | None, tuple[Trial, ...]] = None, ()  # in the last markers
+        # In the last markers: the result, the trials and the scene.
+        self._shown: tuple[CalibrationResult | None, tuple[Trial, ...], str] = None, (), ''
 
     def send(self, name: str, message: Any) -> None:
         """Record a message, then publish it: whatever a subscriber received is on the disk."""
@@ -199,12 +200,13 @@ class Outlet:
                 state.markers.wanted and collector.count and now - state.markers.last >= period):
             return
         state.markers = Pace(last=now)
-        result, trials = state.result, collector.trials
-        if trials and result is self._shown[0] and alike(trials, self._shown[1]):
+        result, trials, scene = state.result, collector.trials, self._graph.options().scene
+        if trials and result is self._shown[0] and alike(trials, self._shown[1]) and scene == self._shown[2]:
             return
-        self._shown = result, trials
+        self._shown = result, trials, scene
         self.send('markers', markers(self._types, trials, stamp=self._graph.stamp(),
-                                     frame_id=collector.frame_id, result=result, pose=collector.pose))
+                                     frame_id=collector.frame_id, result=result, pose=collector.pose,
+                                     obstacles=shown_obstacles(scene)))
 
 
 QUIET = 0.5  # s without action or goal chain, after which the last trial counts as complete

@@ -30,7 +30,11 @@ FULL = {
         {'kind': 'two_hands', 'hands': ['a', 'b'], 'fractions': [0.0, 1.0], 'motion': 'apart',
          'distance': 0.02, 'moving': 'both', 'height': 0.0, 'speed': 0.1, 'hold': True,
          'with_previous': False},
-        {'kind': 'release', 'hands': ['right_hand'], 'with_previous': False}]}]}
+        {'kind': 'release', 'hands': ['right_hand'], 'with_previous': False}]}],
+    'obstacles': [{'photograph': A, 'kind': 'peg', 'first': [50, 60], 'second': [55, 60.5], 'height': 0.04,
+                   'turn': 0.0},
+                  {'photograph': B, 'kind': 'box', 'first': [100, 20], 'second': [150, 90], 'height': 0.1,
+                   'turn': -0.5}]}
 
 
 def changed(path, value):
@@ -75,6 +79,15 @@ for _ in range(500):
     (('dlo', 'points'), 10**400, 'dlo, points'),
     (('dlo', 'points'), 20.5, 'dlo, points'),
     (('photographs',), {}, 'photographs'),
+    (('obstacles',), [{}] * 21, 'obstacles'),
+    (('obstacles', 0, 'kind'), 'cone', 'obstacle 1, kind'),
+    (('obstacles', 1, 'photograph'), 'dddddddd', 'obstacle 2'),
+    (('obstacles', 0, 'height'), 0.0, 'obstacle 1, height'),
+    (('obstacles', 0, 'height'), float('inf'), 'obstacle 1, height'),
+    (('obstacles', 1, 'first'), [1.0], 'obstacle 2, first'),
+    (('obstacles', 1, 'second'), [1.0, None], 'obstacle 2, second 2'),
+    (('obstacles', 1, 'turn'), 100, 'obstacle 2, turn'),
+    (('obstacles', 1, 'colour'), 'red', 'obstacle 2'),
     (('photographs',), [{'id': A}] * 201, 'photographs'),
     (('photographs', 1, 'id'), A, 'photographs'),
     (('photographs', 0, 'id'), '../../..', 'photograph 1, id'),

@@ -3,6 +3,9 @@
 
 """The verb `export`: which file it writes, and what it refuses."""
 
+import re
+
+from exported_scene import write_scene
 import numpy as np
 import pytest
 
@@ -11,6 +14,7 @@ from dlo_calibration.export import export_mjcf, export_sdf, export_usd
 from dlo_calibration.files.chain_file import read_chain_file
 from dlo_calibration.files.result import read_result
 from dlo_calibration.files.session import samples
+from dlo_calibration.simulation.scene import read_mesh
 
 ROPE, START = samples() / 'xml/dlo.xml', samples() / 'chains/start.csv'
 
@@ -69,3 +73,26 @@ def test_a_file_that_is_no_result_is_refused(export):
     code, error, _ = export('--format', 'mjcf', result=START)
     assert code == 2
     assert error.count('\n') == 1
+
+
+def test_the_obstacles_of_a_scene_go_into_the_file_and_meshes_beside_it(export, tmp_path):
+    scene = tmp_path / 'scene'
+    scene.mkdir()
+    code, _, file = export('--format', 'sdf', '--scene', write_scene(scene))
+    assert code == 0
+    name = re.search('<uri>(.*)</uri>', file.read_text())[1]
+    assert len(read_mesh(str(file.parent / name))) == 4
+
+
+def test_the_scene_of_a_calibration_is_exported_or_missed(export, tmp_path):
+    write_scene(tmp_path)
+    result = tmp_path / 'result.xml'
+    result.write_text(re.sub(r'name="scene" value=".*?"', 'name="scene" value="scene.urdf"',
+                             ROPE.read_text()))
+    code, _, file = export('--format', 'mjcf', result=result)
+    assert code == 0
+    assert 'name="obstacle_4"' in file.read_text()
+    (tmp_path / 'scene.urdf').unlink()
+    code, error, _ = export('--format', 'mjcf', result=result)
+    assert code == 2
+    assert 'give it with --scene' in error

@@ -96,7 +96,7 @@ def test_a_picture_that_cannot_be_written_prevents_no_other(run, session, tmp_pa
 
 def test_pictures_go_to_the_working_directory_by_default(run, session, tmp_path, monkeypatch):
     monkeypatch.setattr('dlo_calibration.report.drawing.session_picture',
-                        lambda trials, chains, path: path.touch())
+                        lambda trials, chains, path, obstacles: path.touch())
     (tmp_path / 'here').mkdir()
     monkeypatch.chdir(tmp_path / 'here')
     assert run('plot', session)[0] == 0

@@ -3,10 +3,12 @@
 
 """export_mjcf: a file that MuJoCo reads, with the stiffness, the shapes and the remarks of the DLO."""
 
+from exported_scene import write_scene
 from lxml import etree
 from made_up_dlo import arc, MadeUpDlo, straight
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from dlo_calibration import export_mjcf, InputError, Options, read_result
 from dlo_calibration.export import ExportedRope
@@ -108,3 +110,46 @@ def test_mujoco_holds_the_rest_shape_without_a_force(loaded):
     _, bent = loaded(export_mjcf(dlo, arc(2.0 * 0.6), options=Options(nodes=41)))
     _, other = loaded(export_mjcf(dlo, straight(), options=Options(nodes=41)))
     assert np.abs(bent.qfrc_spring).max() < 0.01 * np.abs(other.qfrc_spring).max()
+
+
+def test_mujoco_has_the_obstacles_of_the_scene_where_they_stand(loaded, tmp_path):
+    options = Options(nodes=13, scene=write_scene(tmp_path))
+    model, state = loaded(export_mjcf(MadeUpDlo(), straight(), options=options))
+    rope = ExportedRope.of(MadeUpDlo(), straight(), options)
+    sizes = {0: [0.1, 0.2, 0.05], 1: [0.05, 0, 0], 2: [0.01, 0.1, 0], 3: [0.02, 0.05, 0]}
+    for number, obstacle in enumerate(rope.obstacles):
+        geom = model.geom(f'obstacle_{number}').id
+        assert model.geom_bodyid[geom] == 0  # it does not move
+        assert model.geom_friction[geom][0] == pytest.approx(rope.friction * obstacle.friction)
+        assert model.geom_priority[geom] > model.geom('dlo_0').priority[0]
+        if obstacle.shape != 'mesh':
+            assert model.geom_size[geom] == pytest.approx(sizes[number])
+            assert state.geom_xpos[geom] == pytest.approx(obstacle.position)
+            assert state.geom_xmat[geom] == pytest.approx(
+                Rotation.from_quat(obstacle.turn).as_matrix().ravel(), abs=1e-9)
+    geom = model.geom('obstacle_4').id
+    mesh = model.geom_dataid[geom]
+    first = model.mesh_vertadr[mesh]
+    corners = model.mesh_vert[first:first + model.mesh_vertnum[mesh]]
+    corners = corners @ state.geom_xmat[geom].reshape(3, 3).T + state.geom_xpos[geom]
+    expected = [(-0.3, 0, 0), (-0.2, 0, 0), (-0.2, 0, 0.2), (-0.2, 0.1, 0)]
+    assert np.array(sorted(np.round(corners, 6).tolist())) == pytest.approx(np.array(expected), abs=1e-5)
+
+
+def test_a_dlo_that_mujoco_drops_on_a_box_rests_on_it(loaded, tmp_path):
+    mujoco = pytest.importorskip('mujoco')
+    scene = tmp_path / 'box.urdf'
+    scene.write_text('<robot name="box"><link name="box"><collision><origin xyz="0.3 0 0.05"/><geometry>'
+                     '<box size="0.8 0.8 0.1"/></geometry></collision></link></robot>')
+    options = Options(nodes=13, scene=str(scene))
+    model, state = loaded(export_mjcf(MadeUpDlo(), arc(height=0.12), options=options))
+    while state.time < 1.0:
+        mujoco.mj_step(model, state)
+    radius = ExportedRope.of(MadeUpDlo(), straight(), options).radius
+    heights = np.array([state.site(f'dlo_point_{k}').xpos[2] for k in range(21)])
+    assert heights == pytest.approx(np.full(21, 0.1 + radius), abs=5e-4)
+
+
+def test_obstacles_whose_dents_are_lost_are_named(tmp_path):
+    assert 'convex hull' in export_mjcf(MadeUpDlo(), straight(), options=Options(scene=write_scene(tmp_path)))
+    assert 'convex hull' not in export_mjcf(MadeUpDlo(), straight())

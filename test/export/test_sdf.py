@@ -5,15 +5,17 @@
 
 from dataclasses import replace
 
+from exported_scene import write_scene
 from lxml import etree
 from made_up_dlo import arc, MadeUpDlo, straight
 import numpy as np
 import pytest
 
 from dlo_calibration import Chain, Options
-from dlo_calibration.export import export_sdf, ExportedRope
+from dlo_calibration.export import export_sdf, ExportedRope, sdf_meshes
 from dlo_calibration.model.parameters import PAPER_PARAMETERS, ParameterSpace, rest_shape
 from dlo_calibration.model.pose import Pose
+from dlo_calibration.simulation.scene import read_mesh
 
 OPTIONS = Options(nodes=13)
 
@@ -138,11 +140,56 @@ def test_a_verdict_of_a_stranger_cannot_end_the_comment():
     assert 'stiffness EI: ' in model.find('.').getchildren()[0].text
 
 
-def test_drake_reads_it():
+def test_drake_reads_it(tmp_path):
     parsing = pytest.importorskip('pydrake.multibody.parsing', reason='needs Drake')
     from pydrake.multibody.plant import MultibodyPlant
 
+    options = Options(nodes=13, scene=write_scene(tmp_path))
+    (tmp_path / 'model.sdf').write_text(export_sdf(MadeUpDlo(), arc(), options=options))
+    for name, content in sdf_meshes(options).items():
+        (tmp_path / name).write_bytes(content)
     plant = MultibodyPlant(1e-3)
-    parsing.Parser(plant).AddModelsFromString(export_sdf(MadeUpDlo(), arc(), options=OPTIONS), 'sdf')
+    parsing.Parser(plant).AddModels(str(tmp_path / 'model.sdf'))
     plant.Finalize()
-    assert plant.num_positions() == 7 + 2 * 11
+    assert plant.num_positions() == 7 + 2 * 11  # the obstacles do not move
+    context = plant.CreateDefaultContext()
+    for number, obstacle in enumerate(ExportedRope.of(MadeUpDlo(), arc(), options).obstacles):
+        pose = plant.EvalBodyPoseInWorld(context, plant.GetBodyByName(f'obstacle_{number}'))
+        assert pose.translation() == pytest.approx(obstacle.position)
+
+
+def test_the_obstacles_of_the_scene_are_a_static_model(tmp_path):
+    options = Options(nodes=13, scene=write_scene(tmp_path))
+    model = model_of(MadeUpDlo(), straight(), options)
+    rope = ExportedRope.of(MadeUpDlo(), straight(), options)
+    obstacles = model.find('model')
+    assert obstacles.get('name') == 'obstacles' and obstacles.findtext('static') == 'true'
+    links = obstacles.findall('link')
+    for link, obstacle in zip(links, rope.obstacles, strict=True):
+        assert numbers(link, 'pose') == pytest.approx([*obstacle.position, *obstacle.turn])
+        assert link.find('pose').get('rotation_format') == 'quat_xyzw'
+        assert link.find('collision/geometry')[0].tag == obstacle.shape
+        assert numbers(link, 'collision/surface/friction/ode/mu') == pytest.approx(
+            [rope.friction * obstacle.friction])
+    assert numbers(links[0], 'collision/geometry/box/size') == pytest.approx([0.2, 0.4, 0.1])
+    assert numbers(links[1], 'collision/geometry/sphere/radius') == pytest.approx([0.05])
+    assert [numbers(links[2], f'collision/geometry/cylinder/{name}')[0] for name in ('length', 'radius')] == [
+        0.2, 0.01]
+    assert numbers(links[3], 'visual/geometry/capsule/length') == pytest.approx([0.1])
+
+
+def test_the_meshes_of_the_scene_are_files_beside_the_model(tmp_path):
+    options = Options(nodes=13, scene=write_scene(tmp_path))
+    (name, content), = sdf_meshes(options).items()
+    assert {uri.text for uri in model_of(MadeUpDlo(), straight(), options).iter('uri')} == {name}
+    (tmp_path / name).write_bytes(content)
+    triangles = read_mesh(str(tmp_path / name))
+    assert triangles.min(axis=(0, 1)) == pytest.approx([-0.1, 0, 0])  # mirrored
+    assert triangles.max(axis=(0, 1)) == pytest.approx([0, 0.1, 0.2])
+    volume = np.linalg.det(triangles).sum() / 6  # positive: the faces are seen from outside
+    assert volume == pytest.approx(0.1 * 0.1 * 0.2 / 6)
+    assert sdf_meshes(OPTIONS) == {}
+
+
+def test_without_a_scene_there_is_no_other_model():
+    assert model_of(MadeUpDlo(), straight()).find('model') is None

@@ -7,6 +7,7 @@ from dataclasses import replace
 import re
 import warnings
 
+from exported_scene import write_scene
 from made_up_dlo import arc, LENGTH, MadeUpDlo, straight
 import numpy as np
 import pytest
@@ -23,9 +24,9 @@ def with_values(**fixed):
     return MadeUpDlo(space=ParameterSpace(PAPER_PARAMETERS, fixed, mass=0.03))
 
 
-def text_of(dlo, chain, form='newton-1.6'):
+def text_of(dlo, chain, form='newton-1.6', options=OPTIONS):
     """Return the text of a file."""
-    return export_usd(dlo, chain, form=form, options=OPTIONS)
+    return export_usd(dlo, chain, form=form, options=options)
 
 
 def value(text, name):
@@ -124,10 +125,11 @@ def test_another_form_is_refused():
         text_of(MadeUpDlo(), straight(), 'newton-1.5')
 
 
-def everything(form):
+def everything(form, options=OPTIONS):
     """Return the text of a DLO that has all there can be in a file."""
     chain = Chain(arc().points, features=np.isin(np.arange(21), [0, 10]))
-    return text_of(with_values(natural_curvature=30.0, marker_mass=60.0, self_collision=100.0), chain, form)
+    return text_of(with_values(natural_curvature=30.0, marker_mass=60.0, self_collision=100.0), chain, form,
+                   options)
 
 
 @pytest.mark.parametrize('form', ['newton-1.6', 'newton-1.4'])
@@ -176,3 +178,44 @@ def test_newton_reads_mass_stiffness_damping_friction_and_rest_shape(tmp_path):
     assert rest == pytest.approx(np.linalg.norm(rope.natural_curvature, axis=1) * rope.cells, rel=1e-2)
     assert builder.shape_material_mu[0] == pytest.approx(rope.friction, rel=1e-5)
     assert builder.shape_scale[0][0] == pytest.approx(rope.radius, rel=1e-5)
+
+
+def blocks(text):
+    """Return the kind and the text of each obstacle."""
+    return re.findall(r'def (\w+) "obstacle_\d" \((.*?)\n {8}\}', text, re.DOTALL)
+
+
+def test_the_obstacles_of_the_scene_stand_beside_the_dlo(tmp_path):
+    options = Options(nodes=13, scene=write_scene(tmp_path))
+    text, rope = text_of(MadeUpDlo(), straight(), options=options), ExportedRope.of(
+        MadeUpDlo(), straight(), options)
+    assert 'defaultPrim = "scene"' in text and '</scene/dlo/material>' in text
+    assert [kind for kind, _ in blocks(text)] == ['Cube', 'Sphere', 'Cylinder', 'Capsule', 'Mesh']
+    for (_, block), obstacle in zip(blocks(text), rope.obstacles, strict=True):
+        place = re.search(r'xformOp:translate = \((.*)\)', block)[1].split(', ')
+        turn = re.search(r'xformOp:orient = \((.*)\)', block)[1].split(', ')
+        assert np.array(place, dtype=float) == pytest.approx(obstacle.position)
+        assert np.array(turn, dtype=float) == pytest.approx(np.roll(obstacle.turn, 1))
+    assert 'xformOp:scale = (0.2, 0.4, 0.1)' in blocks(text)[0][1]
+    assert 'double height = 0.2' in blocks(text)[2][1] and 'double radius = 0.01' in blocks(text)[2][1]
+    assert vectors(blocks(text)[4][1], 'points').min(axis=0) == pytest.approx([-0.1, 0, 0])
+    friction = re.search(r'"obstacle_0_material" .*?staticFriction = (\S+)', text, re.DOTALL)[1]
+    assert (float(friction) * rope.friction)**0.5 == pytest.approx(0.5 * rope.friction)
+
+
+@pytest.mark.parametrize('form', ['newton-1.6', 'newton-1.4'])
+def test_usd_core_finds_no_fault_in_the_obstacles(form, tmp_path):
+    usd = pytest.importorskip('pxr.Usd', reason='needs usd-core')
+    validation = pytest.importorskip('pxr.UsdValidation', reason='needs usd-core 25.11 or later')
+    geometry = pytest.importorskip('pxr.UsdGeom')
+    (tmp_path / 'dlo.usda').write_text(everything(form, Options(nodes=13, scene=write_scene(tmp_path))))
+    stage = usd.Stage.Open(str(tmp_path / 'dlo.usda'))
+    validators = validation.ValidationRegistry().GetOrLoadAllValidators()
+    faults = validation.ValidationContext(validators).Validate(stage)
+    assert [fault.GetMessage() for fault in faults] == []
+    boxes = geometry.BBoxCache(usd.TimeCode.Default(), [geometry.Tokens.default_])
+    capsule, mesh = (boxes.ComputeWorldBound(stage.GetPrimAtPath(f'/scene/obstacles/obstacle_{number}')
+                                             ).ComputeAlignedRange() for number in (3, 4))
+    assert np.array(capsule.GetMin()) == pytest.approx([0.48, 0.43, 0.0], abs=1e-6)
+    assert np.array(capsule.GetMax()) == pytest.approx([0.52, 0.57, 0.04], abs=1e-6)
+    assert np.array(mesh.GetMin()) == pytest.approx([-0.3, 0.0, 0.0], abs=1e-6)

@@ -57,7 +57,7 @@ def server(tmp_path_factory, chromium):
 @pytest.fixture
 def empty(server):
     """Give the server with an empty project."""
-    server.change(lambda document: document.update(photographs=[], trials=[]))
+    server.change(lambda document: document.update(photographs=[], trials=[], obstacles=[]))
     return server
 
 
@@ -363,6 +363,39 @@ def test_the_place_where_a_hand_opened_and_drawn_waypoints_are_marked(opened, pr
     tab.keys('Tab')
     way = seen(lambda: (places := steps()[1]['waypoints']) and places[-1][2] > 0 and places)
     assert np.allclose(way, [[*table((125, 250)), 0], [*table((187, 262)), 0.03]], atol=2e-3)
+
+
+def test_a_peg_is_clicked_given_a_height_and_removed(opened, prepared):
+    def obstacles():
+        return prepared.state()['document']['obstacles']
+
+    tab = opened()
+    tab.step('Scale')
+    tab.find('summary:has-text("Obstacles")').click()
+    tab.button('Add a peg').click()
+    tab.find('.panel p:has-text("Click the middle of the peg’s top.")').wait_for()
+    tab.click((200, 250))
+    tab.find('.panel p:has-text("rim")').wait_for()
+    tab.click((205, 250))
+    peg, = seen(obstacles)
+    assert peg['kind'] == 'peg' and peg['first'] == pytest.approx([200, 250], abs=1)
+    tab.field('Height of peg 1 in mm').fill('30')
+    tab.keys('Tab')
+    seen(lambda: obstacles()[0]['height'] == pytest.approx(0.03))
+    tab.find('.line.obstacle').nth(1).wait_for()
+    assert tab.violations() == []
+    tab.photograph('Goal')
+    tab.find('.line.obstacle').nth(1).wait_for()  # it stands in that photograph, too
+    tab.photograph('Start')
+    first = obstacles()[0]['first']
+    tab.mark('obstacle 0 0').focus()
+    tab.keys('Shift+ArrowRight')
+    seen(lambda: obstacles()[0]['first'] == pytest.approx([first[0] + 10, first[1]], abs=0.01))
+    tab.button('Remove peg 1').click()
+    seen(lambda: not obstacles())
+    tab.button('Undo').click()
+    seen(obstacles)
+    assert tab.overflow() == 0
 
 
 def test_the_wheel_zooms_under_the_pointer_and_dragging_the_background_moves_it(opened, prepared):

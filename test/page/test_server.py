@@ -24,6 +24,7 @@ from capture_page import (
     PER_METRE,
     served,
     START,
+    table,
     ToyInformation,
     whole_trial,
 )
@@ -33,8 +34,10 @@ import pytest
 from toy_simulator import new_toy, ToySimulator
 
 from dlo_calibration.cli import main as cli
+from dlo_calibration.files.result import read_result
 from dlo_calibration.page import information
 from dlo_calibration.page.calibration import ProjectCalibration
+from dlo_calibration.simulation.scene import read_scene
 
 pytestmark = pytest.mark.usefixtures('without_drawings')
 
@@ -427,3 +430,49 @@ def test_unusable_input_is_refused_in_one_sentence(tmp_path, capsys):
     assert 'evaluations' in refusal_of(capsys, tmp_path / 'one', '--evaluations', -1)
     with served(tmp_path / 'two'):
         assert 'another capture' in refusal_of(capsys, tmp_path / 'two')
+
+
+def with_peg(document):
+    """Let a low peg of 16 mm stand beside the DLO; the camera looks straight down."""
+    photograph = document['photographs'][0]['id']
+    document['obstacles'] = [
+        {'photograph': photograph, 'kind': 'peg', 'first': [200, 250], 'second': [205, 250], 'height': 0.002}]
+
+
+def test_obstacles_on_the_photograph_are_the_scene_of_the_calibration(tmp_path, command):
+    folder = tmp_path / 'project'
+    with served(folder, '--evaluations', 4, '--calibrate', 'flexibility', 'friction') as page:
+        whole_trial(page)
+        state = page.change(with_peg)
+        start, goal = (photograph['id'] for photograph in state['document']['photographs'])
+        assert state['obstacles'][0]['problem'] is None
+        assert len(state['photographs'][start]['obstacles'][0]) == 2
+        assert len(state['photographs'][goal]['obstacles'][0]) == 2  # it stands there, too
+        page.done('POST', 'api/calibrate', {'seed': 3})
+        state = page.until(lambda state: 'report.html' in state['calibration']['files'], 'the report')
+        assert not state['calibration']['result']['outdated']
+        for path in (folder / 'obstacles.urdf', folder / 'result' / 'obstacles.urdf'):
+            peg, = read_scene(str(path))
+            assert peg.position[:2] == pytest.approx(table((200, 250)), abs=2e-3)
+            assert 2 * peg.sizes[1] == pytest.approx(0.016, rel=0.05)
+        scene = read_result(folder / 'result' / 'result.xml').file_options.options().scene
+        assert scene == str((folder / 'result' / 'obstacles.urdf').resolve())
+        assert command('fit', folder / 'result' / 'session.mcap', '--json')[1]['score'] == (
+            state['calibration']['result']['score'])
+        assert page.get('api/files/obstacles.urdf') == (folder / 'obstacles.urdf').read_bytes()
+        state = page.change(lambda document: document['obstacles'][0].update(height=0.03))
+        assert state['calibration']['outdated']
+        kept, = read_scene(str(folder / 'result' / 'obstacles.urdf'))
+        assert kept.sizes[0] == 0.002  # with which it was calibrated
+
+
+def test_a_calibration_with_an_obstacle_that_has_no_place_is_refused(tmp_path):
+    with served(tmp_path) as page:
+        whole_trial(page)
+        page.change(with_peg)
+        state = page.change(lambda document: document['obstacles'][0].update(second=[200, 250]))
+        assert 'obstacle 1' in state['obstacles'][0]['problem']
+        _, sentence = page.refused('POST', 'api/calibrate', {})
+        assert 'obstacle 1' in sentence
+        page.change(lambda document: document.update(obstacles=[]))
+        assert 'no obstacle yet' in page.refused('GET', 'api/files/obstacles.urdf')[1]

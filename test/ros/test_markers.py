@@ -6,7 +6,9 @@
 from dataclasses import replace
 import math
 
+from exported_scene import write_scene
 from fitted import fitted
+from made_up_dlo import made_up_plan
 import numpy as np
 import pytest
 from toy_messages import toy_trials, TRUTH
@@ -17,8 +19,16 @@ from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.parameters import measured, ParameterSpace
 from dlo_calibration.model.pose import Pose
 from dlo_calibration.model.trial import Goal
-from dlo_calibration.ros.markers import alike, error_colour, markers, MOST_POINTS
+from dlo_calibration.ros.markers import (
+    alike,
+    error_colour,
+    markers,
+    MOST_POINTS,
+    plan_markers,
+    shown_obstacles,
+)
 from dlo_calibration.search import RandomSearch
+from dlo_calibration.simulation.scene import read_scene
 
 STAMP = 12_500_000_000
 ADD, DELETE_ALL = 0, 3
@@ -202,3 +212,57 @@ def test_hand_that_grips_between_points_is_shown_there(types):
     grip = shown(types, [trial])['trial_1/hands'][1]
     expected = trial.initial.points[3] + 0.25 * (trial.initial.points[4] - trial.initial.points[3])
     assert np.allclose(points(grip), expected, atol=2e-3)
+
+
+def obstacle_marks(types, folder, pose=None):
+    """Return the markers of the obstacles of a scene, in the frame of a camera if there is a pose."""
+    obstacles = read_scene(write_scene(folder))
+    array = wire(types)(markers(types, toy_trials(1), stamp=STAMP, frame_id='table', pose=pose,
+                                obstacles=obstacles))
+    return obstacles, [marker for marker in array.markers if marker.ns == 'scene/obstacles']
+
+
+def place(marker):
+    """Return the pose of a marker."""
+    at, turn = marker.pose.position, marker.pose.orientation
+    return Pose([at.x, at.y, at.z], [turn.x, turn.y, turn.z, turn.w])
+
+
+def test_obstacles_are_shown_as_what_they_are(types, tmp_path):
+    obstacles, marks = obstacle_marks(types, tmp_path)
+    cube, sphere, cylinder, capsule, *ends, mesh = marks
+    assert [marker.type for marker in marks] == [1, 2, 3, 3, 2, 2, 11]
+    assert len({marker.id for marker in marks}) == len(marks)
+    sizes = [[marker.scale.x, marker.scale.y, marker.scale.z] for marker in marks]
+    assert sizes == [pytest.approx(size) for size in (
+        [0.2, 0.4, 0.1], [0.1] * 3, [0.02, 0.02, 0.2], [0.04, 0.04, 0.1], [0.04] * 3, [0.04] * 3, [1.0] * 3)]
+    for marker, obstacle in zip((cube, sphere, cylinder, capsule), obstacles, strict=False):
+        assert place(marker).position == pytest.approx(obstacle.position)
+        assert np.abs(place(marker).orientation @ obstacle.turn) == pytest.approx(1)
+    assert sorted(end.pose.position.y for end in ends) == pytest.approx([0.45, 0.55])  # it lies along y
+    corners = points(mesh)
+    assert len(corners) == 12
+    assert corners.min(axis=0) == pytest.approx([-0.3, 0, 0])
+    assert corners.max(axis=0) == pytest.approx([-0.2, 0.1, 0.2])
+
+
+def test_obstacles_stand_in_the_frame_of_the_table_wherever_the_camera_is(types, tmp_path):
+    camera = Pose([0.2, -0.1, 1.5], [0.95, 0.05, 0.02, 0.3])
+    obstacles, marks = obstacle_marks(types, tmp_path, camera)
+    edge = np.array([0.1, 0.2, 0.05])  # a corner of the box, in its own frame
+    expected = Pose(obstacles[0].position, obstacles[0].turn).points(edge)
+    assert camera.points(place(marks[0]).points(edge)) == pytest.approx(expected)
+    seen = camera.points(place(marks[-1]).points(points(marks[-1])))
+    assert seen.min(axis=0) == pytest.approx([-0.3, 0, 0], abs=1e-6)
+
+
+def test_a_plan_is_shown_with_its_obstacles(types, tmp_path):
+    array = wire(types)(plan_markers(types, made_up_plan(), stamp=STAMP, frame_id='table',
+                                     obstacles=shown_obstacles(write_scene(tmp_path))))
+    marks = [marker for marker in array.markers if marker.ns == 'scene/obstacles']
+    assert [marker.type for marker in marks] == [1, 2, 3, 3, 2, 2, 11]
+
+
+def test_a_scene_that_cannot_be_read_is_not_shown():
+    assert shown_obstacles('nowhere.urdf') == ()
+    assert shown_obstacles('') == ()

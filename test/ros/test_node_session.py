@@ -10,6 +10,7 @@ import re
 import threading
 import time
 
+from exported_scene import write_scene
 import pytest
 from toy_graph import PATIENCE, ToyGraph, TYPES, values, whole
 from toy_messages import MINUTE, session_messages, toy_trials, trial_messages
@@ -304,6 +305,15 @@ def test_a_scene_that_cannot_be_used_is_refused_at_the_start(start):
     assert not done
     assert answer.startswith('scene nowhere.urdf: ')
     assert (graph.status['state'], graph.status['last_refusal']) == ('collecting', answer)
+
+
+def test_obstacles_are_shown_with_the_trials(start, tmp_path):
+    graph = start(make=make_simulator, scene=write_scene(tmp_path))
+    graph.send(session_messages(TYPES, 1))
+    graph.elapsed += 2.0
+    graph.session.tick()
+    names = {marker.ns for marker in graph.heard['markers'][-1].markers}
+    assert {'scene/obstacles', 'trial_1/goal'} <= names
 
 
 def test_a_scene_that_cannot_be_used_ends_a_start_by_itself(start):

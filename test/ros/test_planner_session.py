@@ -5,6 +5,7 @@
 
 from dataclasses import replace
 
+from exported_scene import write_scene
 import numpy as np
 import pytest
 from toy_graph import TYPES
@@ -79,6 +80,14 @@ def test_a_plan_is_published_as_steps_action_and_markers(started):
     assert {marker.header.frame_id for marker in markers} == {'table'}
     assert {marker.ns for marker in markers[1:]} == {'plan/start', 'plan/goal', 'plan/label', *(
         f'action_{k}/{name}' for k in (1, 2) for name in ('predicted', 'interval', 'hands', 'label'))}
+
+
+def test_the_obstacles_that_are_planned_with_are_shown(started, tmp_path):
+    graph = started(ToyPlan(), simulation=[f'scene={write_scene(tmp_path)}'])
+    graph.send_chains(CHAIN, MOVED)
+    graph.planned()
+    shown = [marker for marker in graph.heard['markers'][-1].markers if marker.ns == 'scene/obstacles']
+    assert len(shown) == 7
 
 
 def test_the_calibrator_reads_the_published_action_as_that_of_the_plan(started):

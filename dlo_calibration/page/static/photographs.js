@@ -320,6 +320,7 @@ export class PhotographsStep {
       now.photographs = now.photographs.filter((photograph) => photograph.id !== id);
       for (const photograph of now.photographs)
         if (photograph.scale?.photograph === id) photograph.scale = null;
+      now.obstacles = now.obstacles.filter((obstacle) => obstacle.photograph !== id);
       now.trials = now.trials.filter((trial) => trial.start !== id);
       for (const trial of now.trials)
         for (const role of ['goal', 'start_side', 'goal_side']) if (trial[role] === id) trial[role] = null;

@@ -8,11 +8,13 @@ import {button, problem} from './parts.js';
 import {interval, isComponent, measured, number, words} from './words.js';
 
 const MARKS = {identifiable: 'good', 'weakly identifiable': 'weak', 'not identifiable': 'bad'};
+const SCENE = 'obstacles.urdf';
 const FILES = {
   'report.html': 'Report',
   'result.xml': 'Result (XML)',
   'session.mcap': 'Session (MCAP)',
   'request.xml': 'Request (XML)',
+  [SCENE]: 'Obstacles (URDF), which session and request name',
   'evaluations.csv': 'All tried parameter sets (CSV)',
 };
 const LEAST = 4; // width of the interval on its bar, of 100, so that the mark of the value never hides it
@@ -125,6 +127,7 @@ function bar({value, lower, upper}) {
 
 function files(app, calibration) {
   const there = calibration.files ?? Object.keys(FILES);
+  const {obstacles} = app.project.document;
   const chains = app.used().filter(([, , id]) => app.project.seen(id)?.trace?.length);
   return h(
     'details',
@@ -134,7 +137,7 @@ function files(app, calibration) {
       'ul.files',
       {},
       Object.entries(FILES)
-        .filter(([name]) => there.includes(name) || BEFORE.includes(name))
+        .filter(([name]) => [...there, ...BEFORE].includes(name) || (name === SCENE && obstacles.length))
         .map(([name, text]) =>
           h(
             'li',

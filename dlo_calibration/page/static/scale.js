@@ -6,6 +6,7 @@
 import {h} from './dom.js';
 import {KnownPoints, PLACE} from './known_points.js';
 import {line} from './line.js';
+import {Obstacles} from './obstacles.js';
 import {boards, button, choice, files, legend, numeric, problem} from './parts.js';
 import {millimetres} from './words.js';
 
@@ -16,10 +17,12 @@ export class ScaleStep {
   title = 'Scale';
   sides = true;
   #points;
+  #obstacles;
 
   constructor(app) {
     this.app = app;
     this.#points = new KnownPoints(app);
+    this.#obstacles = new Obstacles(app);
   }
 
   what() {
@@ -45,6 +48,11 @@ export class ScaleStep {
   }
 
   clicks() {
+    return this.#pointed || this.#obstacles.placing;
+  }
+
+  /** Whether the scale of the photograph comes from points that are clicked. */
+  get #pointed() {
     return this.app.photograph?.scale?.kind === 'points';
   }
 
@@ -95,6 +103,7 @@ export class ScaleStep {
         : null,
       problem(app.project, PLACE),
       h('div', {role: 'status'}, this.#outcome(seen)),
+      this.#obstacles.panel(),
       this.#lens(),
     ];
   }
@@ -206,29 +215,34 @@ export class ScaleStep {
         h('g.label', {'data-u': u, 'data-v': v}, h('text', {x: 4, y: -4}, label)),
       );
     });
-    const points = this.clicks() ? this.#points.marks(photograph) : [];
+    const points = this.#pointed ? this.#points.marks(photograph) : [];
     const corners = points.length
       ? []
       : (seen.scale?.pixels ?? []).map(([u, v], k) =>
           h('g.corner', {key: `corner${k}`, 'data-u': u, 'data-v': v}, h('circle', {r: 3})),
         );
-    return [...grid, ...corners, ...points];
+    return [...grid, ...corners, ...points, ...this.#obstacles.drawn()];
   }
 
   tap(pixel) {
-    if (this.clicks()) this.#points.tap(pixel);
+    if (this.#obstacles.placing) this.#obstacles.tap(pixel);
+    else if (this.#pointed) this.#points.tap(pixel);
   }
 
   grab(name) {
-    return this.#points.grab(name);
+    return this.#of(name).grab(name);
   }
 
   nudge(name, by) {
-    this.#points.nudge(name, by);
+    this.#of(name).nudge(name, by);
   }
 
   press(name, key) {
-    return this.#points.press(name, key);
+    return this.#of(name).press(name, key);
+  }
+
+  #of(mark) {
+    return mark.startsWith('obstacle') ? this.#obstacles : this.#points;
   }
 
   #set(scale, merge) {
@@ -267,9 +281,11 @@ export class ScaleStep {
     return [
       this.app.seen?.scale
         ? legend(
-            [['grid', 'grid of the table'], this.clicks() ? ['mark known', 'known point'] : null].filter(
-              Boolean,
-            ),
+            [
+              ['grid', 'grid of the table'],
+              this.#pointed ? ['mark known', 'known point'] : null,
+              this.app.seen.obstacles?.length ? ['obstacle', 'top and foot of an obstacle'] : null,
+            ].filter(Boolean),
           )
         : null,
     ];

@@ -1,0 +1,117 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+What obstacles of a scene look like: outlines for drawings, triangles of meshes for drawings and markers.
+
+A drawing looks along a direction; its projection, (2, 3), gives the coordinates of a point in it.
+"""
+
+from __future__ import annotations
+
+from typing import Sequence, TYPE_CHECKING
+
+import numpy as np
+
+from dlo_calibration.model.action import rotation_matrix
+from dlo_calibration.model.chain import Floats
+from dlo_calibration.report.figure import EDGE, OBSTACLE
+from dlo_calibration.simulation.scene import Obstacle
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+MOST_TRIANGLES = 5000  # shown of a mesh; more cannot be distinguished
+CELLS = 40  # along the longest edge of a mesh, of which each keeps one corner
+AROUND = 64  # corners of a circle
+ABOVE = np.eye(3)[:2]  # the projection seen from above
+
+
+def seen_from_above(obstacle: Obstacle) -> Floats:
+    """Return the outline seen from above, (k, 2) [m] x and y, anticlockwise; of a mesh, its convex hull."""
+    return outline(obstacle, ABOVE)
+
+
+def seen_from_the_side(obstacle: Obstacle, across: Floats) -> Floats:
+    """
+    Return the outline seen from the side, (k, 2) [m], anticlockwise; of a mesh, its convex hull.
+
+    :param across: (3,) horizontal unit vector, the first coordinate in the drawing; the second is z.
+    """
+    return outline(obstacle, np.array([across, [0.0, 0.0, 1.0]]))
+
+
+def outline(obstacle: Obstacle, projection: Floats) -> Floats:
+    """Return the outline in a projection, (k, 2) [m], anticlockwise; of a mesh, its convex hull."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    points = _surface(obstacle) @ projection.T
+    try:
+        corners: Floats = points[ConvexHull(points).vertices]
+    except QhullError:  # a flat mesh, seen along its plane
+        return points[[int(np.lexsort(points.T)[end]) for end in (0, -1)]]
+    return corners
+
+
+def triangles_of(obstacle: Obstacle) -> Floats:
+    """
+    Return the triangles of a mesh where it stands, (t, 3, 3) [m]; at most about `MOST_TRIANGLES`.
+
+    A larger mesh is made coarser: all corners in a cell of a grid become one, in their middle.
+    """
+    scaled = obstacle.triangles * obstacle.sizes
+    if len(scaled) > MOST_TRIANGLES:
+        scaled = _coarser(scaled)
+    placed: Floats = scaled @ rotation_matrix(obstacle.turn).T + obstacle.position
+    return placed
+
+
+def draw_obstacles(axes: Axes, obstacles: Sequence[Obstacle], projection: Floats) -> None:
+    """Draw obstacles behind everything else, without changing the section that the axes show."""
+    from matplotlib.collections import PolyCollection
+
+    for number, obstacle in enumerate(obstacles):
+        shapes = list(triangles_of(obstacle) @ projection.T) if obstacle.shape == 'mesh' else [
+            outline(obstacle, projection)]
+        # The edges of triangles, in their colour, close the gaps between them.
+        axes.add_collection(PolyCollection(
+            shapes, facecolor=OBSTACLE, edgecolor=EDGE if len(shapes) == 1 else OBSTACLE, linewidth=0.8,
+            zorder=0.3, label=None if number else 'obstacle'), autolim=False)
+
+
+def _surface(obstacle: Obstacle) -> Floats:
+    """Return points, (m, 3) [m], whose convex hull is that of the obstacle."""
+    if obstacle.shape == 'mesh':
+        return triangles_of(obstacle).reshape(-1, 3)
+    if obstacle.shape == 'box':
+        signs = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T
+        points = signs * obstacle.sizes
+    else:
+        radius = obstacle.sizes[-1]
+        # Circles of latitude make a sphere, or both ends of a capsule; a cylinder has only its rims.
+        turns = np.linspace(0, 2 * np.pi, AROUND, endpoint=False)
+        rises = np.linspace(-np.pi / 2, np.pi / 2, AROUND // 2 + 1) if obstacle.shape != 'cylinder' else 0.0
+        turn, rise = (angles.ravel() for angles in np.meshgrid(turns, rises))
+        points = radius * np.stack([np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn),
+                                    np.sin(rise)], axis=1)
+        if obstacle.shape != 'sphere':
+            half = np.array([0.0, 0.0, obstacle.sizes[0] / 2])
+            points = np.concatenate([points - half, points + half])
+    placed: Floats = points @ rotation_matrix(obstacle.turn).T + obstacle.position
+    return placed
+
+
+def _coarser(triangles: Floats) -> Floats:
+    """Return a mesh, (t, 3, 3), with one corner at most in each cell of a grid."""
+    corners = triangles.reshape(-1, 3)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    cells = np.floor((corners - low) / ((high - low).max() / CELLS)).astype(int)
+    _, of_cell = np.unique(cells, axis=0, return_inverse=True)
+    of_cell = of_cell.ravel()
+    count = np.bincount(of_cell)
+    middles = np.stack([np.bincount(of_cell, weights=axis) / count for axis in corners.T], axis=1)
+    faces = of_cell.reshape(-1, 3)
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    coarse: Floats = middles[faces[np.sort(first)]]
+    return coarse
