@@ -61,7 +61,7 @@ class Plan:
     :param score_after: the paper's difference score after all actions [cm], averaged likewise; its focal
         point is the first point, its features are the marked points, or both ends if there are none.
     :param reached: whether `error_after` is within the tolerance; if the score is minimised, together with
-        the score for each of its terms.
+        the score for each of its terms; with a share of the length for each body passed at a wrong side.
     :param tolerance: [m].
     :param rollouts: number of simulated actions.
     :param seconds: that the plan took.
