@@ -19,7 +19,6 @@ from dlo_calibration.model.trial import Goal, shown_goals, Trial
 from dlo_calibration.planning.plan import Plan, PlannedAction
 from dlo_calibration.planning.prediction import PredictedStep, Prediction
 from dlo_calibration.planning.rehearsal import ActionStep, motion_of_actions, rehearsed_trial
-from dlo_calibration.planning.surroundings import outline
 from dlo_calibration.report.animation import Captions, write_animation
 from dlo_calibration.report.drawing import hand_colours, View
 from dlo_calibration.report.figure import (
@@ -31,13 +30,13 @@ from dlo_calibration.report.figure import (
     SIMULATED,
     write_figure,
 )
+from dlo_calibration.report.obstacles import ABOVE, draw_obstacles
 from dlo_calibration.report.sentences import distance, of_length, width
 from dlo_calibration.simulation.motion import MOST_FRAMES, simulated_motion
 from dlo_calibration.simulation.protocol import Simulator
 from dlo_calibration.simulation.scene import Obstacle
 
 COLUMNS = 3  # of panels, at most
-BODY = '#8c7b6b'
 
 
 def write_plan_picture(plan: Plan, path: str | Path, *, obstacles: Sequence[Obstacle] = ()) -> None:
@@ -65,7 +64,7 @@ def write_plan_picture(plan: Plan, path: str | Path, *, obstacles: Sequence[Obst
         for k, (axes, trial) in enumerate(zip(panels, trials, strict=False)):
             view = View(axes, trial, above=True)
             view.draw_start('before the action' if plan.actions else 'the DLO')
-            _draw_obstacles(view, obstacles)
+            draw_obstacles(view.axes, obstacles, ABOVE)
             if plan.actions:
                 _draw_predicted(view, plan.actions[k], plan.actions[k].predicted)
                 _draw_ways(view, plan.actions[k].action.hands, colours)
@@ -147,15 +146,6 @@ def _draw_ways(view: View, hands: Sequence[Hand], colours: Mapping[str, str],
         view.axes.plot(*way[:, -1:], 's', color=colour, markerfacecolor='none' if opens else colour,
                        markersize=8, zorder=5, linestyle='none',
                        label=as_text(f'{hand.name} opens') if opens else None)
-
-
-def _draw_obstacles(view: View, obstacles: Sequence[Obstacle]) -> None:
-    """Draw what stands around the DLO, seen from above, without making the panel wider for it."""
-    from matplotlib.patches import Polygon
-
-    for k, obstacle in enumerate(obstacles):
-        view.axes.add_artist(Polygon(outline(obstacle), facecolor=BODY, edgecolor='black', linewidth=0.6,
-                                     zorder=0.8, label=None if k else 'body of the scene'))
 
 
 def _draw_goal(view: View) -> None:

@@ -15,8 +15,8 @@ from dlo_calibration import Chain, InputError
 from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.planning.dlo import Posterior
 from dlo_calibration.report.drawing import View
-from dlo_calibration.report.figure import BAND, blank_figure, SIMULATED
-from dlo_calibration.report.plan_drawing import BODY, plan_trial, write_plan_animation, write_plan_picture
+from dlo_calibration.report.figure import BAND, blank_figure, OBSTACLE, SIMULATED
+from dlo_calibration.report.plan_drawing import plan_trial, write_plan_animation, write_plan_picture
 from dlo_calibration.report.sentences import plan_sentences
 from dlo_calibration.simulation.scene import NO_TRIANGLES, Obstacle
 
@@ -43,7 +43,7 @@ def test_a_picture_shows_the_bodies_of_a_scene(tmp_path):
                     np.array([0, 0, 0, 1.0]), 1.0, NO_TRIANGLES)
     bare, shown = (pixels(made_up_plan(actions=1), tmp_path / 'plan.png', obstacles=obstacles)
                    for obstacles in ((), (post,)))
-    assert of_colour(bare, BODY) == 0 and of_colour(shown, BODY) > 500
+    assert of_colour(bare, OBSTACLE) == 0 and of_colour(shown, OBSTACLE) > 500
 
 
 def test_a_picture_that_cannot_be_written_is_an_input_error(tmp_path):
