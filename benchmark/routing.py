@@ -7,7 +7,8 @@ Routing: plans that lead a DLO around pegs, executed in reality; write results/r
 A task has two to four pegs at random places beside a DLO that lies nearly straight, and a goal that a hand
 has made in reality: it led one end around the pegs, at random sides, and then dragged two random points to
 random places.  A planner that knows the true parameters sees the DLO with noise, and plans; the first action
-is executed in a finer simulation; then it plans anew.
+is executed in a finer simulation; then it plans anew.  In further tasks, a straight DLO is to be laid into a
+clip: between two pegs 1.2 diameters apart.
 
     python benchmark/routing.py [--tasks N] [--seed S]
 """
@@ -51,6 +52,8 @@ DRAGGED = (0.04, 0.10)  # m
 NEARBY = 0.05  # m between the middle lines of a peg and of the goal that passes it
 WIDE = 0.03  # m from the middle of a peg to the way of the hand that makes the goal
 NOISE = 1e-3  # m, standard deviation of each coordinate that the camera sees
+CLIPS = ((0.35, -0.06), (0.35, 0.1), (0.5, -0.06), (0.5, 0.1))  # share of the length, and m aside
+CLIP_RADIUS = 0.004  # m
 FRAMES, MOST_FRAMES = 200.0, 100_000  # per second, and in all, in which passages through pegs are looked for
 ACTIONS = 8  # executed, at most
 REACHED = 2.0  # % of the length
@@ -113,6 +116,17 @@ def random_task(index: int, seed: int, folder: Path) -> Task:
             goal = routed(dlo, start, pegs, left * sides[:, None], surroundings, simulator, generator)
         if goal is not None and fair(dlo, start, goal, surroundings):
             return Task(dlo, pegs, scene, start, goal)
+
+
+def clip_task(index: int, folder: Path) -> Task:
+    """Return the task to lay a DLO into a clip, one of CLIPS for each of the known DLOs."""
+    dlo = KNOWN_DLOS[index % len(KNOWN_DLOS)]
+    share, aside = CLIPS[index // len(KNOWN_DLOS)]
+    goal, scene = bent(dlo, 0.0), folder / f'clip_{index}.urdf'
+    apart = 1.2 * dlo.radius + CLIP_RADIUS
+    pegs = np.array([[share * dlo.length, side * apart, CLIP_RADIUS] for side in (-1, 1)])
+    write_scene(pegs, scene)
+    return Task(dlo, pegs, scene, goal + [0.0, aside, 0.0], goal)
 
 
 def bent(dlo: KnownDlo, angle: float) -> Floats:
@@ -273,18 +287,19 @@ def whole_search(task: Task) -> tuple[int, int, float, float]:
     return len(task.pegs), 3, time.monotonic() - begun, time.process_time() - working
 
 
-def table(outcomes: list[tuple[Task, Outcome]], seed: int) -> str:
+def table(outcomes: list[tuple[Task, Outcome]], clips: list[tuple[Task, Outcome]], seed: int) -> str:
     """Return the document with the outcomes of tasks."""
     searches = [whole_search(task) for task, _ in outcomes if len(task.pegs) == max(PEGS)]
     reached = sum(outcome.reached for _, outcome in outcomes)
     through = sum(outcome.passages for _, outcome in outcomes)
     times = [(len(task.pegs), *each) for task, outcome in outcomes for each in zip(
         outcome.planned, outcome.seconds, outcome.worked, strict=True)]
+    filled = sum(outcome.reached for _, outcome in clips)
     rows = [f'| {k} | {task.dlo.name} | {len(task.pegs)} | {outcome.errors[0]:.1f} | '
             f'{outcome.errors[-1]:.2f} | {len(outcome.errors) - 1} | '
             f'{max(outcome.seconds, default=0.0):.1f} | {1e3 * outcome.nearest:.1f} | {outcome.passages} | '
             f'{"yes" if outcome.reached else f"no: {outcome.why}"} |'
-            for k, (task, outcome) in enumerate(outcomes, 1)]
+            for k, (task, outcome) in enumerate([*outcomes, *clips], 1)]
     text = (
         f'**{reached} of {len(outcomes)} tasks reached**: within {REACHED:g} % of the length on average, and '
         f'all pegs passed at the right side. The DLO went through a peg {through} times. Each peg has a '
@@ -299,6 +314,11 @@ def table(outcomes: list[tuple[Task, Outcome]], seed: int) -> str:
         '# Routing around pegs', '',
         f'Made by `python benchmark/routing.py --tasks {len(outcomes)} --seed {seed}`.', '',
         *textwrap.wrap(text, 108), '',
+        *textwrap.wrap(
+            f'**{filled} of {len(clips)} clips filled**, likewise, from a straight DLO that lies '
+            f'{1e3 * abs(CLIPS[0][1]):g} or {1e3 * abs(CLIPS[1][1]):g} mm aside. A clip is two pegs with a '
+            f'diameter of {2e3 * CLIP_RADIUS:g} mm, 1.2 diameters of the DLO apart: no hand passes between '
+            f'them. They are the tasks from {len(outcomes) + 1} on.', 108), '',
         '| plans | number | s, median | s, longest | s of all processors together, median | longest |',
         '|---|---|---|---|---|---|',
         _times('all', times),
@@ -325,22 +345,25 @@ def main() -> None:
     parser.add_argument('--seed', type=int, default=1)
     parser.add_argument('--only', type=int, action='append',
                         help='conduct this task alone, and write nothing')
-    chosen = parser.parse_args()
-    outcomes = []
+    chosen, count = parser.parse_args(), len(CLIPS) * len(KNOWN_DLOS)
+    outcomes: list[tuple[Task, Outcome]] = []
+    clips: list[tuple[Task, Outcome]] = []
     with tempfile.TemporaryDirectory() as folder:
-        for index in range(chosen.tasks) if chosen.only is None else [each - 1 for each in chosen.only]:
+        for number in chosen.only or range(1, chosen.tasks + count + 1):
+            index = number - 1
             begun = time.monotonic()
-            task = random_task(index, chosen.seed, Path(folder))
+            task = random_task(index, chosen.seed, Path(folder)) if index < chosen.tasks else \
+                clip_task(index - chosen.tasks, Path(folder))
             made = time.monotonic() - begun
             outcome = conduct(task, index, chosen.seed)
-            outcomes.append((task, outcome))
+            (outcomes if index < chosen.tasks else clips).append((task, outcome))
             print(f'{index + 1}: {task.dlo.name}, {len(task.pegs)} pegs, made in {made:.1f} s: '
                   f'{"reached" if outcome.reached else "NOT reached"}: '
                   f'{", ".join(f"{error:.2f}" for error in outcome.errors)} %; plans '
                   f'{", ".join(f"{taken:.1f}" for taken in outcome.seconds)} s; passages {outcome.passages}, '
                   f'wrong {outcome.wrong}, nearest {1e3 * outcome.nearest:.1f} mm {outcome.why}', flush=True)
         if chosen.only is None:
-            RESULT.write_text(table(outcomes, chosen.seed), encoding='utf-8')
+            RESULT.write_text(table(outcomes, clips, chosen.seed), encoding='utf-8')
 
 
 if __name__ == '__main__':

@@ -38,6 +38,7 @@ NEAR = 2.0  # times the tolerance; below that cost, all displacements are refine
 TOGETHER = 3  # Gauss-Newton steps for all displacements of a sequence
 PATIENCE = 1  # consecutive actions that need not gain anything
 OTHER_SIDE = 0.15  # share of the length that counts as a distance for each body passed at the wrong side
+SCREENS = 8  # draws in which a move that brings the DLO past a body is tried, at most
 SELDOM = 0.1  # share of the draws in which the DLO may bear more than permitted
 
 Result = TypeVar('Result')
@@ -61,7 +62,7 @@ class Objective:
     def __init__(self, start: Chain, goal: Chain, kind: str, surroundings: Surroundings = NOTHING) -> None:
         self.goal = goal.points
         self.posts = surroundings.posts(start.points, goal.points)  # (p, 2) [m]
-        self._detour = OTHER_SIDE * start.length
+        self.detour = OTHER_SIDE * start.length  # m, for each of them
         self._scored = kind == SCORE
         marked = np.flatnonzero(start.features | goal.features)
         self._features: NDArray[np.intp] = marked if len(marked) else np.array([0, len(goal) - 1])
@@ -70,9 +71,11 @@ class Objective:
     def cost(self, points: Floats) -> float:
         """Return what is minimised [m], for an (n, 3) [m] chain."""
         cost = self.error(points) + (self.score(points) / 100 / self._terms if self._scored else 0.0)
-        if len(self.posts):
-            cost += self._detour * passed_wrongly(points, self.goal, self.posts)
-        return cost
+        return cost + self.detour * self.wrong(points)
+
+    def wrong(self, points: Floats) -> int:
+        """Return how often an (n, 3) [m] chain passes bodies at another side than the goal."""
+        return passed_wrongly(points, self.goal, self.posts) if len(self.posts) else 0
 
     def residuals(self, points: Floats) -> Floats:
         """Return (m,) residuals [m], whose sum of squares is minimised in place of the cost."""
@@ -311,12 +314,37 @@ class BeamSearch:
                 drafts += list(filter(self._permits, each))[:1]
         simulated = yield from self._tried(drafts)
         pairs = [(draft, grown) for draft, grown in zip(drafts, simulated, strict=True) if grown is not None]
+        screened = yield from self._screened([grown for _, grown in pairs])
+        pairs = [(draft, grown) for (draft, _), grown in zip(pairs, screened, strict=True)]
         chosen: list[tuple[Draft, MoveSequence]] = []
         for sequence in beam:
             own = sorted((pair for pair in pairs if pair[0].base is sequence), key=lambda pair: pair[1].cost)
             chosen += own[:REFINED]
         refined = yield from self._refined([draft for draft, _ in chosen], [grown for _, grown in chosen], 1)
+        refined = yield from self._screened(refined)
         return self._distinct(sorted(refined, key=lambda sequence: sequence.cost))[:WIDTH]
+
+    def _screened(self, sequences: Sequence[MoveSequence]) -> Asking[list[MoveSequence]]:
+        """
+        Return sequences with the costs of draws in which the last move does not bring the DLO past a body.
+
+        Only some of the moves that do so with the best parameters do so reliably.
+        """
+        objective = self._objective
+        passing = [sequence for sequence in sequences
+                   if objective.wrong(sequence.end) < objective.wrong(sequence.chains[-2])]
+        draws = self._draws[:SCREENS]
+        jobs = [RehearsalJob(self._start, steps, physical, self._watched) for sequence in passing
+                for steps in [self._steps(sequence.moves, sequence.chains[:-1])] for physical in draws]
+        rehearsals = iter((yield jobs) if jobs else [])
+        costs = {}
+        for sequence in passing:
+            failed = [bool(draw.failure or self._refusal(draw))
+                      or objective.wrong(draw.chains[-1]) > objective.wrong(sequence.end)
+                      for draw in islice(rehearsals, len(draws))]
+            costs[sequence] = sequence.cost + objective.detour * float(np.mean(failed or [False]))
+        return [replace(sequence, cost=costs[sequence]) if sequence in costs else sequence
+                for sequence in sequences]
 
     def _distinct(self, sequences: Sequence[MoveSequence]) -> list[MoveSequence]:
         """Return sequences, best first, without those that end nearly where a better one does."""
