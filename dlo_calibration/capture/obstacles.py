@@ -61,12 +61,18 @@ def _placed(entry: ObstacleEntry, scale: Scale | None, name: str) -> PlacedObsta
                     np.array([0.0, 0.0, np.sin(turn / 2), np.cos(turn / 2)]), 1.0, NO_TRIANGLES)
 
 
-def seen_obstacle(obstacle: Obstacle, scale: Scale) -> list[Floats]:
-    """Return the closed lines around its top and its foot in a photograph, each (n, 2) [px]."""
+def lines_around(obstacle: Obstacle) -> list[Floats]:
+    """Return the closed lines around its top and its foot, each (n, 3) [m]."""
     line = seen_from_above(obstacle)[::ON_CIRCLE if obstacle.shape == 'cylinder' else 1]
     line = np.concatenate([line, line[:1]])
-    return [scale.to_pixels(np.column_stack([line, np.full(len(line), height)]))
-            for height in (2 * obstacle.position[2], 0.0)]
+    return [np.column_stack([line, np.full(len(line), height)]) for height in (2 * obstacle.position[2], 0.0)]
+
+
+def seen_lines(lines: Sequence[Floats], scale: Scale) -> list[Floats]:
+    """Return lines, each (n, 3) [m], in a photograph, each (n, 2) [px]; without those behind the camera."""
+    pixels = scale.to_pixels(np.concatenate([*lines, np.zeros((0, 3))]))
+    pieces = np.split(pixels, np.cumsum([len(line) for line in lines]))[:len(lines)]
+    return [piece for piece in pieces if np.isfinite(piece).all()]
 
 
 def scene_document(obstacles: Sequence[Obstacle]) -> bytes:

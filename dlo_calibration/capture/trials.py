@@ -21,7 +21,7 @@ from dlo_calibration.capture.document import TrialEntry
 from dlo_calibration.capture.hands import held_after, Hold, move, Movements, PAUSE
 from dlo_calibration.capture.json_values import plain
 from dlo_calibration.capture.measurement import Measurement, Measurer, numbers
-from dlo_calibration.capture.obstacles import place_obstacles, PlacedObstacle, seen_obstacle
+from dlo_calibration.capture.obstacles import lines_around, place_obstacles, PlacedObstacle, seen_lines
 from dlo_calibration.capture.project import Project
 from dlo_calibration.capture.trial_warnings import check_axes, check_hands, check_photograph, TrialWarnings
 from dlo_calibration.errors import InputError
@@ -242,12 +242,15 @@ class Drafts:
                 'obstacles': [{'sizes': None, 'problem': str(placed)} if isinstance(placed, InputError) else
                               {'sizes': numbers(placed.sizes, 6), 'problem': None} for placed in self.placed]}
 
-    def _outlines(self, photograph: Measurement) -> list[list[Any]]:
-        """Return the lines around top and foot of each obstacle, in pixels; none without a scale."""
+    @cached_property
+    def _lines(self) -> list[Floats]:
+        """The lines around top and foot of the obstacles, each (n, 3) [m]."""
+        return [line for obstacle in self.obstacles for line in lines_around(obstacle)]
+
+    def _outlines(self, photograph: Measurement) -> list[Any]:
+        """Return the lines around the obstacles as pixels of a photograph; none without a scale."""
         scale = photograph.scale
-        return [] if scale is None else [
-            [numbers(line) for line in seen_obstacle(obstacle, scale) if np.isfinite(line).all()]
-            for obstacle in self.obstacles]
+        return [] if scale is None else [numbers(line) for line in seen_lines(self._lines, scale)]
 
 
 class Drafter:

@@ -446,8 +446,8 @@ def test_obstacles_on_the_photograph_are_the_scene_of_the_calibration(tmp_path, 
         state = page.change(with_peg)
         start, goal = (photograph['id'] for photograph in state['document']['photographs'])
         assert state['obstacles'][0]['problem'] is None
-        assert len(state['photographs'][start]['obstacles'][0]) == 2
-        assert len(state['photographs'][goal]['obstacles'][0]) == 2  # it stands there, too
+        assert len(state['photographs'][start]['obstacles']) == 2
+        assert len(state['photographs'][goal]['obstacles']) == 2  # it stands there, too
         page.done('POST', 'api/calibrate', {'seed': 3})
         state = page.until(lambda state: 'report.html' in state['calibration']['files'], 'the report')
         assert not state['calibration']['result']['outdated']

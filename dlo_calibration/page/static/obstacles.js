@@ -139,9 +139,7 @@ export class Obstacles {
   /** Describe the lines and marks over the photograph. */
   drawn() {
     const {id, seen} = this.app;
-    const lines = (seen.obstacles ?? []).flatMap((around, k) =>
-      around.map((pixels, part) => line(pixels, 'obstacle', `around ${k} ${part}`)),
-    );
+    const lines = (seen.obstacles ?? []).map((pixels, k) => line(pixels, 'obstacle', `around ${k}`));
     const marks = this.#all.flatMap((obstacle, k) =>
       obstacle.photograph === id
         ? ENDS.map((end, part) =>

@@ -9,7 +9,7 @@ import pytest
 
 from dlo_calibration.capture.document import Document
 from dlo_calibration.capture.measurement import Measurement
-from dlo_calibration.capture.obstacles import place_obstacles, scene_document, seen_obstacle
+from dlo_calibration.capture.obstacles import lines_around, place_obstacles, scene_document, seen_lines
 from dlo_calibration.errors import InputError
 from dlo_calibration.simulation.scene import read_scene
 from dlo_calibration.vision.lens import Lens
@@ -60,7 +60,7 @@ def test_a_peg_and_a_turned_box_stand_where_they_are_however_the_camera_looks(tm
 def test_its_lines_are_drawn_around_its_top_and_its_foot():
     scale = slanted()
     peg, = placed(scale, clicked(scale, 'peg', (0.2, 0.1), (0.22, 0.1), 0.08))
-    top, foot = seen_obstacle(peg, scale)
+    top, foot = seen_lines(lines_around(peg), scale)
     for line, height in ((top, 0.08), (foot, 0.0)):
         around = scale.to_table(line, height)[:, :2] - (0.2, 0.1)
         assert np.linalg.norm(around, axis=1) == pytest.approx(np.full(len(around), 0.02))
