@@ -443,7 +443,7 @@ def test_a_session_with_a_scene_is_repeated_with_it(tmp_path, monkeypatch, capsy
     first, again = ({key: value for key, value in document.items() if key != 'seconds'}
                     for document in documents)
     assert first == again
-    assert (first['engine'], first['confirmation']) == ('bullet', None)
+    assert (first['engine'], first['confirmation']['engine']) == ('compiled', 'bullet')
     assert read_result('out/result.xml').file_options.refusal is not None  # not in its folder
     assert f"--scene '{scene}'" in html.unescape(Path('out/report.html').read_text(encoding='utf-8'))
     assert cli.main(['validate', 'out/result.xml', str(session), '--json']) == 0
@@ -455,8 +455,12 @@ def test_a_session_with_a_scene_is_repeated_with_it(tmp_path, monkeypatch, capsy
     assert 'give it with --scene' in error
 
 
-def test_compiled_engine_and_scene_end_with_one_line(session, capsys):
-    assert cli.main(['fit', str(session), '--engine', 'compiled', '--scene', 'peg.urdf']) == 2
+def test_a_mesh_that_is_not_closed_ends_with_one_line(session, tmp_path, capsys):
+    (tmp_path / 'mesh.obj').write_text('v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n', encoding='utf-8')
+    scene = tmp_path / 'mesh.urdf'
+    scene.write_text('<robot name="m"><link name="m"><collision><geometry><mesh filename="mesh.obj"/>'
+                     '</geometry></collision></link></robot>', encoding='utf-8')
+    assert cli.main(['fit', str(session), '--scene', str(scene)]) == 2
     assert capsys.readouterr().err.splitlines()[-1] == (
-        'dlo-calibration: engine compiled: scene peg.urdf; expected no scene: it simulates only a table; '
-        'use engine bullet or auto')
+        'dlo-calibration: scene: a mesh that is not closed: 3 of 3 edges are open; expected closed meshes; '
+        'close it in the program that made it, or use engine bullet')

@@ -92,7 +92,8 @@ def test_every_file_is_used():
     listed = {SAMPLES / 'README.md', *SAMPLES.glob('make_*.py'), *SAMPLES.glob('xml/*.xml')}
     listed |= {SAMPLES / 'photographs' / name
                for name in ('README.md', 'truth.json', 'first.jpg', 'second.jpg', 'third.jpg')}
-    listed |= {SAMPLES / 'chains' / name for name in ('start.csv', 'goal.csv', 'hairpin.csv')}
+    listed |= {SAMPLES / 'chains' / name for name in ('start.csv', 'goal.csv', 'hairpin.csv',
+                                                   'around_posts.csv', 'posts.urdf')}
     assert files(SAMPLES) == listed | {message_file(kind) for kind in INPUT_TYPES} | files(*SESSIONS)
     readme = (SAMPLES / 'README.md').read_text(encoding='utf-8')
     for name in ('make_yaml.py', *(f'{kind}.yaml' for kind in INPUT_TYPES),
