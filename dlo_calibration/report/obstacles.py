@@ -67,7 +67,7 @@ def triangles_of(obstacle: Obstacle) -> Floats:
 
 
 def draw_obstacles(axes: Axes, obstacles: Sequence[Obstacle], projection: Floats) -> None:
-    """Draw obstacles behind everything else, without changing the section that the axes show."""
+    """Draw obstacles behind chains, but before bands, without changing the section that the axes show."""
     from matplotlib.collections import PolyCollection
 
     for number, obstacle in enumerate(obstacles):
@@ -76,7 +76,7 @@ def draw_obstacles(axes: Axes, obstacles: Sequence[Obstacle], projection: Floats
         # The edges of triangles, in their colour, close the gaps between them.
         axes.add_collection(PolyCollection(
             shapes, facecolor=OBSTACLE, edgecolor=EDGE if len(shapes) == 1 else OBSTACLE, linewidth=0.8,
-            zorder=0.3, label=None if number else 'obstacle'), autolim=False)
+            zorder=0.6, label=None if number else 'obstacle'), autolim=False)
 
 
 def _surface(obstacle: Obstacle) -> Floats:

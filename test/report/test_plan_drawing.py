@@ -43,7 +43,8 @@ def test_a_picture_shows_the_bodies_of_a_scene(tmp_path):
                     np.array([0, 0, 0, 1.0]), 1.0, NO_TRIANGLES)
     bare, shown = (pixels(made_up_plan(actions=1), tmp_path / 'plan.png', obstacles=obstacles)
                    for obstacles in ((), (post,)))
-    assert of_colour(bare, OBSTACLE) == 0 and of_colour(shown, OBSTACLE) > 500
+    # The grid has nearly the same grey.
+    assert of_colour(shown, OBSTACLE) > of_colour(bare, OBSTACLE) + 500
 
 
 def test_a_picture_that_cannot_be_written_is_an_input_error(tmp_path):
