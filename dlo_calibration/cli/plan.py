@@ -91,7 +91,7 @@ def write_plan_files(folder: Path, plan: Plan, description: Description, simulat
     from dlo_calibration.report.plan_drawing import write_plan_animation, write_plan_picture
 
     _remove_older(folder)
-    attempts = Attempts(folder)
+    attempts, obstacles = Attempts(folder), obstacles_of(simulation)
     path = folder / PLAN
     with attempts.attempt(f'{PLAN}.json'), whole(path.with_suffix('.json')) as new:
         new.write_text(f'{json.dumps(plain_plan(plan), indent=2, allow_nan=False)}\n', encoding='utf-8')
@@ -102,10 +102,11 @@ def write_plan_files(folder: Path, plan: Plan, description: Description, simulat
         with attempts.attempt(f'{PLAN}.xml'):
             write_request(path.with_suffix('.xml'), plan_request(plan, description, simulation))
     with attempts.attempt(f'{PLAN}.png'):
-        write_plan_picture(plan, path.with_suffix('.png'), obstacles=obstacles_of(simulation))
+        write_plan_picture(plan, path.with_suffix('.png'), obstacles=obstacles)
     if plan.actions:
         with attempts.attempt(f'{PLAN}.gif'), closing(make_simulator(simulation)) as simulator:
-            write_plan_animation(plan, simulator, Posterior.of(description).best, path.with_suffix('.gif'))
+            write_plan_animation(plan, simulator, Posterior.of(description).best, path.with_suffix('.gif'),
+                                 obstacles=obstacles)
     attempts.require()
 
 

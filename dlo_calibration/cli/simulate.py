@@ -14,7 +14,7 @@ from typing import Any, Mapping, Sequence
 
 import numpy as np
 
-from dlo_calibration.calibration.engines import SimulatorFactory
+from dlo_calibration.calibration.engines import obstacles_of, SimulatorFactory
 from dlo_calibration.calibration.options import Options, SIMULATION
 from dlo_calibration.cli.arguments import (
     add_common_arguments,
@@ -34,6 +34,7 @@ from dlo_calibration.observation.table import resting_level
 from dlo_calibration.planning.prediction import DRAWS, plain_prediction, Prediction, simulate
 from dlo_calibration.planning.rehearsal import motion_of_actions
 from dlo_calibration.simulation.protocol import Simulator
+from dlo_calibration.simulation.scene import Obstacle
 from dlo_calibration.workspace.source import read_manipulations
 from dlo_calibration.writing import Attempts, make_folder, whole
 
@@ -84,7 +85,7 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
                  'seconds': time.monotonic() - begun}
         try:
             if chosen.output is not None:
-                write_prediction_files(chosen.output, predictions, about, simulator)
+                write_prediction_files(chosen.output, predictions, about, simulator, obstacles_of(options))
                 print_message(f'the predictions are in {chosen.output}')
         finally:  # whatever the disk does
             if chosen.json:
@@ -144,12 +145,14 @@ def _show(predictions: Named, options: Options, simulator: Simulator) -> None:
 
 
 def write_prediction_files(folder: Path, predictions: Sequence[tuple[str, Prediction]],
-                           about: Mapping[str, Any], simulator: Simulator) -> None:
+                           about: Mapping[str, Any], simulator: Simulator,
+                           obstacles: Sequence[Obstacle] = ()) -> None:
     """
     Write predictions to a folder, as far as possible.
 
     :param predictions: names of trials, which can be anything, and what happens in them.
     :param about: the same, as plain values.
+    :param obstacles: of the scene, for the drawings.
     :raises DloCalibrationError: if files cannot be written; the others are.
     """
     from dlo_calibration.report.plan_drawing import write_prediction_animation, write_prediction_picture
@@ -164,7 +167,8 @@ def write_prediction_files(folder: Path, predictions: Sequence[tuple[str, Predic
                 with attempts.attempt(file):
                     write_chain(folder / file, Chain(step.chain))
         with attempts.attempt(f'trial_{k}.png'):
-            write_prediction_picture(prediction, name, folder / f'trial_{k}.png')
+            write_prediction_picture(prediction, name, folder / f'trial_{k}.png', obstacles=obstacles)
         with attempts.attempt(f'trial_{k}.gif'):
-            write_prediction_animation(prediction, name, simulator, folder / f'trial_{k}.gif')
+            write_prediction_animation(prediction, name, simulator, folder / f'trial_{k}.gif',
+                                       obstacles=obstacles)
     attempts.require()

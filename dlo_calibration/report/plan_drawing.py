@@ -80,7 +80,7 @@ def write_plan_picture(plan: Plan, path: str | Path, *, obstacles: Sequence[Obst
 
 
 def write_plan_animation(plan: Plan, simulator: Simulator, physical: Mapping[str, float],
-                         path: str | Path) -> None:
+                         path: str | Path, *, obstacles: Sequence[Obstacle] = ()) -> None:
     """
     Simulate the actions of a plan, at least one, and write their motion as a GIF.
 
@@ -90,7 +90,7 @@ def write_plan_animation(plan: Plan, simulator: Simulator, physical: Mapping[str
     """
     trial = plan_trial(plan)
     write_animation(trial, simulated_motion(trial, simulator, physical), path,
-                    Captions('plan, simulated', 'start', 'goal'))
+                    Captions('plan, simulated', 'start', 'goal'), obstacles)
 
 
 def plan_trial(plan: Plan) -> Trial:
@@ -162,7 +162,8 @@ def _title(plan: Plan) -> str:
     return f'{count}: from {before} to {after} from the goal'
 
 
-def write_prediction_picture(prediction: Prediction, name: str, path: str | Path) -> None:
+def write_prediction_picture(prediction: Prediction, name: str, path: str | Path, *,
+                             obstacles: Sequence[Obstacle] = ()) -> None:
     """
     Write a PNG with a row an action, seen from above and from the side; of many actions, five are shown.
 
@@ -189,6 +190,7 @@ def write_prediction_picture(prediction: Prediction, name: str, path: str | Path
                 view = View(axes, trials[k], above=above, extent=everything)
                 view.draw_start('before the action')
                 _draw_predicted(view, step, step.chain)
+                view.draw_obstacles(obstacles)
                 _draw_ways(view, step.step.action.hands, colours, step.step.held_by)
                 view.draw_first_point()
                 axes.update_datalim(view.flat(everything).T)  # the same section in all rows
@@ -199,7 +201,7 @@ def write_prediction_picture(prediction: Prediction, name: str, path: str | Path
 
 
 def write_prediction_animation(prediction: Prediction, name: str, simulator: Simulator,
-                               path: str | Path) -> None:
+                               path: str | Path, *, obstacles: Sequence[Obstacle] = ()) -> None:
     """
     Simulate the actions of a prediction again, and write their motion as a GIF.
 
@@ -208,6 +210,6 @@ def write_prediction_animation(prediction: Prediction, name: str, simulator: Sim
     """
     trial, motion = motion_of_actions(prediction.start, [step.step for step in prediction.steps], simulator,
                                       prediction.physical, most=MOST_FRAMES)
-    write_animation(trial, motion, path, Captions(f'{name}, simulated', 'start', ''))
+    write_animation(trial, motion, path, Captions(f'{name}, simulated', 'start', ''), obstacles)
 
 
