@@ -6,14 +6,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dlo_calibration.model.chain import Floats
+from dlo_calibration.simulation import core
 
 MOST_POINTS = 400_000  # of a grid: an object of 20 cm gets cells of 3 mm, in a second
+MOST_MESHES = 50  # of different shapes in a scene: 80 MB
 MARGIN = 0.012  # m around the mesh; further away, the core extrapolates
 NEAR = 4.0  # cells; up to here, distances are exact
 SAMPLES = 2  # per cell and direction, on the surface
@@ -46,8 +48,13 @@ class DistanceGrid:
         """
         return _grid(np.ascontiguousarray(triangles, dtype=float).tobytes())
 
+    @cached_property
+    def shared(self) -> core.Grid:
+        """The same in the core, which all bodies of this mesh share."""
+        return core.Grid(self.distances, self.corner, self.cell)
 
-@lru_cache(maxsize=16)
+
+@lru_cache(maxsize=MOST_MESHES)
 def _grid(octets: bytes) -> DistanceGrid:
     triangles = np.frombuffer(octets).reshape(-1, 3, 3)
     triangles = _closed(triangles)

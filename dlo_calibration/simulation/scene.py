@@ -30,7 +30,7 @@ import numpy as np
 from dlo_calibration.errors import InputError, shortened
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.simulation import core
-from dlo_calibration.simulation.distance_grid import DistanceGrid
+from dlo_calibration.simulation.distance_grid import DistanceGrid, MOST_MESHES
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -114,8 +114,13 @@ def core_scene(obstacles: Sequence[Obstacle]) -> core.Scene:
     """
     Return obstacles as bodies of the core; a mesh becomes a `DistanceGrid`.
 
-    :raises InputError: if a mesh has no inside.
+    :raises InputError: if a mesh has no inside, or there are too many different ones.
     """
+    meshes = {(obstacle.triangles.tobytes(), *obstacle.sizes)
+              for obstacle in obstacles if obstacle.shape == 'mesh'}
+    if len(meshes) > MOST_MESHES:
+        raise InputError('scene', f'{len(meshes)} different meshes', f'at most {MOST_MESHES}',
+                         'join some, or use engine bullet')
     return core.Scene([core_body(obstacle) for obstacle in obstacles])
 
 
@@ -133,7 +138,7 @@ def core_body(obstacle: Obstacle) -> core.Body:
     except ValueError as error:
         raise InputError('scene', f'{error}', 'closed meshes', 'close it in the program that made it, or use '
                          'engine bullet') from error
-    return core.Body.grid(grid.distances, grid.corner, grid.cell, obstacle.position, turn, obstacle.friction)
+    return core.Body.of_grid(grid.shared, obstacle.position, turn, obstacle.friction)
 
 
 def unusable(path: str, came: str, remedy: str = 'correct the file') -> InputError:

@@ -149,14 +149,14 @@ def test_friction_is_that_of_the_scene(scene, among):
 
 def test_a_repeat_in_a_scene_is_bit_exact_whatever_was_simulated_between(scene):
     path = scene(BOX.format(friction=0.7))
-    simulator = BulletSimulator(scene=path, settle_limit=0.5)
+    simulator = BulletSimulator(scene=path, settle_limit=0.1)
     sideways = dropped(0.22, push=(0.02, 0.15, 0.05))
     first = simulator.simulate(sideways, PHYSICAL).chains.tobytes()
     simulator.simulate(dropped(0.25), PHYSICAL)
     again = simulator.simulate(sideways, PHYSICAL).chains.tobytes()
     simulator.simulate(sideways, {**PHYSICAL, 'self_collision': 0.01, 'friction': 1.5})
     other_radius_between = simulator.simulate(sideways, PHYSICAL).chains.tobytes()
-    fresh = BulletSimulator(scene=path, settle_limit=0.5)
+    fresh = BulletSimulator(scene=path, settle_limit=0.1)
     os.remove(path)  # what was read once is not read again
     assert first == again == other_radius_between == fresh.simulate(sideways, PHYSICAL).chains.tobytes()
     simulator.close()
@@ -209,6 +209,7 @@ def test_a_mesh_does_the_same_as_with_pybullets_own_reader(scene, monkeypatch):
     assert chains[0].tobytes() == chains[1].tobytes()
 
 
+@pytest.mark.long
 def test_a_scene_stands_where_pybullets_own_importer_puts_it(scene, capfd):
     inertial = ('<inertial><origin xyz="0.1 0.2 0.3" rpy="0.1 0.2 0"/><mass value="1"/>'
                 '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>')

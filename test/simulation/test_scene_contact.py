@@ -280,7 +280,7 @@ def test_a_distance_grid_knows_inside_from_outside():
     random = np.random.default_rng(0)
     edges = np.array([0.1, 0.2, 0.04])
     grid = DistanceGrid.of(box_mesh(edges))
-    body = core.Body.grid(grid.distances, grid.corner, grid.cell, (0, 0, 0), np.eye(3), 1.0)
+    body = core.Body.of_grid(grid.shared, (0, 0, 0), np.eye(3), 1.0)
     exact = core.Body('box', edges / 2, (0, 0, 0), np.eye(3), 1.0)
     for point in random.uniform(-1, 1, (500, 3)) * (edges / 2 + 0.03):
         if abs(expected := exact.distance(point)) < 0.012:
@@ -308,7 +308,5 @@ def test_the_core_refuses_wrong_bodies(change, message):
     ({'distances': np.full((2, 2, 2), np.inf)}, r'distances: a number that is not finite'),
     ({'cell': 0.0}, r'cell: 0 m; expected a positive')])
 def test_the_core_refuses_wrong_grids(change, message):
-    given = {'distances': np.ones((2, 2, 2)), 'corner': (0, 0, 0), 'cell': 1.0, 'position': (0, 0, 0),
-             'turn': np.eye(3), 'friction': 1.0}
     with pytest.raises(ValueError, match=message):
-        core.Body.grid(**{**given, **change})
+        core.Grid(**{'distances': np.ones((2, 2, 2)), 'corner': (0, 0, 0), 'cell': 1.0, **change})

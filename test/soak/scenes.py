@@ -213,6 +213,8 @@ def simulate(folder: Path, first: int, end: int, seed: int) -> None:
     from dlo_calibration import Action, Chain, DloCalibrationError, Goal, Hand, Trial
     from dlo_calibration.model.parameters import ParameterSpace
     from dlo_calibration.simulation.bullet import BulletSimulator
+    from dlo_calibration.simulation.compiled import CompiledSimulator
+    from dlo_calibration.simulation.scene import read_scene
 
     points = np.linspace((0.0, 0.0, 0.02), (0.4, 0.0, 0.02), 9)
     trial = Trial('drop', Chain(points), (Action((Hand('hand', (0,), [0.0, 0.02], points[[0, 0]]),)),),
@@ -227,6 +229,8 @@ def simulate(folder: Path, first: int, end: int, seed: int) -> None:
         try:
             with closing(BulletSimulator(scene=str(scene), nodes=9, time_step=0.01)) as engine:
                 engine.simulate(trial, physical)
+            CompiledSimulator(obstacles=read_scene(str(scene)), nodes=9, time_step=0.01).simulate(
+                trial, physical)
             outcome = 'simulated'
         except DloCalibrationError as error:
             outcome = 'refused' if len(str(error)) < 1000 else 'died of a refusal that is too long'

@@ -11,6 +11,7 @@ header and one line of `step.hpp`.  `_core.pyi` documents the interface.
 from dlo_calibration.simulation.core._core import (
     Body,
     Event,
+    Grid,
     Grip,
     roll_out,
     Rope,
@@ -21,4 +22,4 @@ from dlo_calibration.simulation.core._core import (
     TARGETS,
 )
 
-__all__ = ['Body', 'Event', 'Grip', 'Rope', 'Scene', 'Script', 'Start', 'Stop', 'TARGETS', 'roll_out']
+__all__ = ['Body', 'Event', 'Grid', 'Grip', 'Rope', 'Scene', 'Script', 'Start', 'Stop', 'TARGETS', 'roll_out']

@@ -93,6 +93,17 @@ class Script:
     def __init__(self, events: Sequence[Event], stable_distance: float, stable_steps: int,
                  loads: bool = False) -> None: ...
 
+class Grid:
+    """
+    Signed distances from a surface at the points of a grid, which several bodies may share.
+
+    :param distances: (x, y, z) [m], single precision.
+    :param corner: (3,) [m] of the first point, in the frame of a body.
+    :param cell: [m] from a point to the next.
+    """
+
+    def __init__(self, distances: ArrayLike, corner: ArrayLike, cell: float) -> None: ...
+
 class Body:
     """
     A body that does not move.
@@ -109,15 +120,8 @@ class Body:
                  ) -> None: ...
 
     @staticmethod
-    def grid(distances: ArrayLike, corner: ArrayLike, cell: float, position: ArrayLike, turn: ArrayLike,
-             friction: float) -> Body:
-        """
-        Return a body of any shape, by the signed distances from its surface at the points of a grid.
-
-        :param distances: (x, y, z) [m], single precision.
-        :param corner: (3,) [m] of the first point, in the frame of the body.
-        :param cell: [m] from a point to the next.
-        """
+    def of_grid(grid: Grid, position: ArrayLike, turn: ArrayLike, friction: float) -> Body:
+        """Return a body of any shape, by the distances from its surface."""
 
     def distance(self, at: ArrayLike) -> float:
         """Return the signed distance [m] of a point (3,) [m] from the surface; negative inside."""

@@ -222,7 +222,7 @@ Body make_body(const std::string& shape, const Array& sizes, const Array& positi
   require(entry != shapes.end(), "shape: ", shape, "; expected sphere, box, cylinder or capsule; use a grid");
   require(sizes.size() == entry->second.second, "sizes: ", sizes.size(), " numbers; expected ",
           entry->second.second, " of a ", shape, "; give as many");
-  Body body{entry->second.first, {}, point("position", position), {}, friction, 0.0, {}, {}, {}};
+  Body body{entry->second.first, {}, point("position", position), {}, friction, 0.0, nullptr};
   for (py::ssize_t k = 0; k < sizes.size(); ++k) {
     body.sizes[k] = sizes.data()[k];
     require(body.sizes[k] > 0.0 && std::isfinite(body.sizes[k]), "sizes: ", body.sizes[k],
@@ -243,29 +243,33 @@ Body with_pose(Body body, const Array& turn, double friction) {
   return body;
 }
 
-std::shared_ptr<Body> make_grid(const py::array_t<float, py::array::c_style | py::array::forcecast>& distances,
-                                const Array& corner, double cell, const Array& position, const Array& turn,
-                                double friction) {
+std::shared_ptr<Grid> make_grid(const py::array_t<float, py::array::c_style | py::array::forcecast>& distances,
+                                const Array& corner, double cell) {
   require(distances.ndim() == 3 && distances.size() <= static_cast<py::ssize_t>(kMostGridPoints),
           "distances: ", distances.ndim(), " dimensions and ", distances.size(), " numbers; expected 3, and at "
           "most ", kMostGridPoints, "; choose a larger cell");
   require(cell > 0.0 && std::isfinite(cell), "cell: ", cell, " m; expected a positive finite number; replace it");
-  Body body{Shape::kGrid, {cell, 0.0, 0.0}, point("position", position), {}, friction, 0.0,
-            point("corner", corner), {}, {distances.data(), distances.data() + distances.size()}};
-  Point furthest{};
+  Grid grid{point("corner", corner), cell, {}, {distances.data(), distances.data() + distances.size()}};
   for (int c = 0; c < 3; ++c) {
-    body.counts[c] = static_cast<int>(distances.shape(c));
-    require(body.counts[c] > 1, "distances: ", body.counts[c], " points in one direction; expected 2 or more; "
+    grid.counts[c] = static_cast<int>(distances.shape(c));
+    require(grid.counts[c] > 1, "distances: ", grid.counts[c], " points in one direction; expected 2 or more; "
             "choose a smaller cell");
-    double& from = c == 0 ? furthest.x : c == 1 ? furthest.y : furthest.z;
-    from = corner.data()[c];
-    const double to = from + cell * (body.counts[c] - 1);
-    from = std::max(std::abs(from), std::abs(to));
   }
-  for (float distance : body.distances)
+  for (float distance : grid.distances)
     require(std::isfinite(distance), "distances: a number that is not finite; expected finite ones; replace it");
-  body.reach = std::sqrt(furthest.x * furthest.x + furthest.y * furthest.y + furthest.z * furthest.z);
-  return std::make_shared<Body>(with_pose(std::move(body), turn, friction));
+  return std::make_shared<Grid>(std::move(grid));
+}
+
+std::shared_ptr<Body> make_grid_body(const std::shared_ptr<const Grid>& grid, const Array& position,
+                                     const Array& turn, double friction) {
+  require(grid != nullptr, "grid: None; expected a Grid; make one");
+  const auto furthest = [&](double from, int count) {
+    return std::max(std::abs(from), std::abs(from + grid->cell * (count - 1)));
+  };
+  const double x = furthest(grid->corner.x, grid->counts[0]), y = furthest(grid->corner.y, grid->counts[1]),
+               z = furthest(grid->corner.z, grid->counts[2]);
+  return std::make_shared<Body>(with_pose({Shape::kGrid, {}, point("position", position), {}, friction,
+                                           std::sqrt(x * x + y * y + z * z), grid}, turn, friction));
 }
 
 std::shared_ptr<Scene> make_scene(const std::vector<std::shared_ptr<const Body>>& bodies) {
@@ -438,6 +442,8 @@ PYBIND11_MODULE(_core, module) {
       .def_static("see", &make_see, "share"_a = py::none());
   py::class_<Script, std::shared_ptr<Script>>(module, "Script", py::module_local())
       .def(py::init(&make_script), "events"_a, "stable_distance"_a, "stable_steps"_a, "loads"_a = false);
+  py::class_<Grid, std::shared_ptr<Grid>>(module, "Grid", py::module_local())
+      .def(py::init(&make_grid), "distances"_a, "corner"_a, "cell"_a);
   py::class_<Body, std::shared_ptr<Body>>(module, "Body", py::module_local())
       .def(py::init([](const std::string& shape, const Array& sizes, const Array& position, const Array& turn,
                        double friction) {
@@ -445,7 +451,7 @@ PYBIND11_MODULE(_core, module) {
                  with_pose(make_body(shape, sizes, position, friction), turn, friction));
            }),
            "shape"_a, "sizes"_a, "position"_a, "turn"_a, "friction"_a)
-      .def_static("grid", &make_grid, "distances"_a, "corner"_a, "cell"_a, "position"_a, "turn"_a, "friction"_a)
+      .def_static("of_grid", &make_grid_body, "grid"_a, "position"_a, "turn"_a, "friction"_a)
       .def("distance", [](const Body& body, const Array& at) { return distance(body, point("at", at)); }, "at"_a);
   py::class_<Scene, std::shared_ptr<Scene>>(module, "Scene", py::module_local())
       .def(py::init(&make_scene), "bodies"_a);

@@ -12,19 +12,25 @@
 
 namespace dlo {
 
+/// Signed distances [m] from a surface at the points of a grid, z fastest; several bodies may share it.
+struct Grid {
+  Point corner;               // first point [m], in the frame of the body
+  double cell;                // [m]
+  std::array<int, 3> counts;  // of points
+  std::vector<float> distances;
+};
+
 enum class Shape { kSphere, kBox, kCylinder, kCapsule, kGrid };
 
 /// A body that does not move.
 struct Body {
   Shape shape;
-  std::array<double, 3> sizes;  // [m] radius; half edges; half length and radius along z; or cell of the grid
+  std::array<double, 3> sizes;  // [m] radius; half edges; or half length and radius along z
   Point position;               // [m] of its frame
   Matrix turn;                  // from its frame to that of the world
   double friction;
   double reach;                 // [m] from `position` to the point furthest away
-  Point corner{};               // first point of the grid [m], in its frame
-  std::array<int, 3> counts{};  // of the grid's points
-  std::vector<float> distances;  // signed [m], at the grid's points, z fastest
+  std::shared_ptr<const Grid> grid;
 };
 
 struct Scene {

@@ -58,19 +58,19 @@ inline Field cylinder_field(const Point& p, double half, double radius) {
 
 /// Trilinear between the points of the grid.  Beyond them, the larger of two lower bounds: the surface lies
 /// behind the nearest point of the grid, and the distance grows at least as it does there if it is convex.
-inline Field grid_field(const Body& body, const Point& p) {
-  const double cell = body.sizes[0];
-  const double at[3] = {(p.x - body.corner.x) / cell, (p.y - body.corner.y) / cell,
-                        (p.z - body.corner.z) / cell};
+inline Field grid_field(const Grid& grid, const Point& p) {
+  const double cell = grid.cell;
+  const double at[3] = {(p.x - grid.corner.x) / cell, (p.y - grid.corner.y) / cell,
+                        (p.z - grid.corner.z) / cell};
   int low[3];
   double share[3], away[3];
   for (int c = 0; c < 3; ++c) {
-    const double inside = min(max(at[c], 0.0), body.counts[c] - 1.0);
-    low[c] = static_cast<int>(min(inside, body.counts[c] - 2.0));
+    const double inside = min(max(at[c], 0.0), grid.counts[c] - 1.0);
+    low[c] = static_cast<int>(min(inside, grid.counts[c] - 2.0));
     share[c] = inside - low[c], away[c] = cell * (at[c] - inside);
   }
-  const int step_y = body.counts[2], step_x = body.counts[1] * step_y;
-  const float* first = &body.distances[low[0] * step_x + low[1] * step_y + low[2]];
+  const int step_y = grid.counts[2], step_x = grid.counts[1] * step_y;
+  const float* first = &grid.distances[low[0] * step_x + low[1] * step_y + low[2]];
   double value = 0.0, slope[3] = {};
   for (int k = 0; k < 8; ++k) {
     const int x = k >> 2, y = k >> 1 & 1, z = k & 1;
@@ -102,7 +102,7 @@ inline Field field_of(const Body& body, const Point& at) {
     case Shape::kCapsule:
       field = of_length({p.x, p.y, p.z - min(max(p.z, -sizes[0]), sizes[0])}, sizes[1], {1.0, 0.0, 0.0});
       break;
-    default: field = grid_field(body, p);
+    default: field = grid_field(*body.grid, p);
   }
   return {field.distance, m * field.gradient};
 }
