@@ -184,6 +184,7 @@ def holds_truth(result):
                for name in ('flexibility', 'friction'))
 
 
+@pytest.mark.long
 def test_a_chaotic_trial_of_a_known_rope_is_named_and_the_result_is_usable():
     result = known_rope(coiled(5))
     assert result.outlier.trial == 'trial 5'

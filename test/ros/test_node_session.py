@@ -539,7 +539,7 @@ def test_a_clock_that_went_back_begins_another_session_and_trials_never_mix(star
 
 def test_a_calibration_goes_on_when_the_clock_goes_back_and_its_result_lies_with_its_trials(
         start, tmp_path, command):
-    graph = start(ToySimulator(0.005))
+    graph = start(ToySimulator(0.002))
     graph.send(session_messages(TYPES, 2))
     graph.session.request('start')
     graph.send(back(session_messages(TYPES, 1)))

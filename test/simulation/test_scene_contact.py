@@ -219,9 +219,10 @@ AROUND_ONE = dragged([(0.6, 0, 0.004), (0.55, 0.2, 0.02), (0.3, 0.25, 0.02), (0.
 AROUND_TWO = dragged([(0.6, 0, 0.004), (0.55, 0.15, 0.02), (0.4, 0.15, 0.02), (0.28, -0.1, 0.02)], 3.0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(('trial', 'obstacles'), [
     pytest.param(AROUND_ONE, pegs((0.4, 0.05)), id='one peg'),
-    pytest.param(AROUND_TWO, pegs((0.45, 0.04), (0.33, -0.03)), id='two pegs', marks=pytest.mark.long)])
+    pytest.param(AROUND_TWO, pegs((0.45, 0.04), (0.33, -0.03)), id='two pegs')])
 def test_a_rope_around_pegs_moves_as_in_pybullet(trial, obstacles):
     """PyBullet adds contact after the step, so that it needs a much shorter one: see `BulletSimulator`."""
     ours = CompiledSimulator(obstacles=obstacles).simulate(trial, PHYSICAL)
