@@ -437,7 +437,7 @@ class BulletSimulator(Engine):
     plus the time for the meshes.
 
     Bullet adds contact after a step of the rope, node by node.  At a point of a taut rope this is a blow that
-    the step spreads over many nodes: with steps of 3 ms, a rope that meets a peg is 10 mm off.  So the steps
+    the step spreads over many nodes: with steps of 3 ms, a rope around a peg is 20 mm off.  So the steps
     among obstacles are shorter.
 
     :param scene: path of a URDF file with fixed obstacles; empty: none.

@@ -37,7 +37,7 @@ struct Scene {
   std::vector<Body> bodies;
 };
 
-/// A place of the DLO that touches a body, or may do so in this step: a node, or a point between two nodes.
+/// A place of the DLO that touches a body, or may do so in this step: a node, or a point between two.
 struct Touch {
   int body, node;
   bool between;                 // it lies between this node and the next
@@ -57,8 +57,8 @@ struct Near {
   double room;  // [m] that any node may move until they can touch
 };
 
-/// Contact is that of the capsules around the segments, so that nothing passes between two nodes.  What lies in
-/// a body at the start may stay there until it has left: a radius that is too large does not throw the DLO away.
+/// Contact is that of the capsules around the segments, so that nothing passes between two nodes.  What lies
+/// in a body at the start may stay there until it has left: a radius that is too large throws nothing away.
 struct SceneContact {
   std::shared_ptr<const Scene> scene;
   double radius = 0.0, friction = 0.0;

@@ -207,7 +207,8 @@ inline std::size_t place_of(const SceneContact& contact, int body, int node, boo
 /// Let what lies in a body at the start stay there.
 inline void begin(SceneContact& contact, const Point* points, int nodes) {
   find_near(contact, points, nodes, 0.0);
-  each_place(contact, [&](int i) { return points[i]; }, HUGE_VAL, [&](int body, int node, double share, const Field& field) {
+  const auto at = [&](int i) { return points[i]; };
+  each_place(contact, at, HUGE_VAL, [&](int body, int node, double share, const Field& field) {
     const double gap = field.distance - contact.radius;
     if (!(gap < 0.0)) return gap;
     if (contact.allowed.empty()) contact.allowed.assign(2 * contact.scene->bodies.size() * nodes, 0.0);
@@ -288,8 +289,8 @@ inline Point velocity_at(const Touch& touch, std::vector<Vec3<Number>>& velociti
 }
 
 /// Take from a solution which bodies push and how the DLO slides; return whether that needs another solution.
-/// A body that pulls always does; friction only at `first`, as it follows from step to step; nothing else does at
-/// `last`.
+/// A body that pulls always does; friction only at `first`, as it follows from step to step; nothing else
+/// does at `last`.
 template <class Number>
 inline bool learn(Rods<Number>& rods, SceneContact& contact, int lane, bool first, bool last) {
   bool changed = false;
@@ -368,7 +369,9 @@ inline void solve_among_bodies(Rods<Number>& rods, const Ropes& ropes) {
           find_near(contact, current(rope, lane), rods.nodes, contact.room);
           find(rope, lane, by);
         } else if (by > in_lane(moved, lane)) {
-          const auto unseen = [&](const Near& near) { return near.room > in_lane(moved, lane) && near.room <= by; };
+          const auto unseen = [&](const Near& near) {
+            return near.room > in_lane(moved, lane) && near.room <= by;
+          };
           if (std::any_of(contact.near.begin(), contact.near.end(), unseen)) find(rope, lane, by);
         }
       }
