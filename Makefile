@@ -135,7 +135,7 @@ figures: bench
 	$(PYTHON) benchmark/worth.py --output build/experiment >/dev/null
 	cp build/experiment/worth.md benchmark/results/worth.md
 	cp build/experiment/worth.png doc/worth.png
-	for name in routing touching from_photographs live_information $(if $(MEASURED),elastica intervals experiment); do $(PYTHON) benchmark/$$name.py; done
+	for name in routing touching pegs from_photographs live_information $(if $(MEASURED),elastica intervals experiment); do $(PYTHON) benchmark/$$name.py; done
 	$(if $(MEASURED),$(PYTHON) benchmark/intervals.py --search random --draws 40)
 
 clean:
