@@ -84,9 +84,9 @@ def main() -> None:
             rows.append([*row, f'{1e3 * result.best.errors.mean:.2f}', f'{1e3 * np.mean(errors):.2f}'])
     text = '\n\n'.join([
         '# Trials among pegs', '`python benchmark/pegs.py`',
-        'Four trials with two pegs each, simulated with 81 nodes and half the time step, and seen with a noise '
-        f'of {1e3 * NOISE:g} mm in each coordinate ({1e3 * NOISE * np.sqrt(8 / np.pi):.1f} mm in the mean). Two '
-        'others are predicted. Values on the scale of 0 to 100, with 90 % intervals.',
+        'Four trials with two pegs each, simulated with 81 nodes and half the time step, and seen with a '
+        f'noise of {1e3 * NOISE:g} mm in each coordinate ({1e3 * NOISE * np.sqrt(8 / np.pi):.1f} mm in the '
+        'mean). Two others are predicted. Values on the scale of 0 to 100, with 90 % intervals.',
         table(['rope', 'flexibility', 'found', 'friction', 'found', 'fitted, mm', 'unseen, mm'], rows),
         f'{sum(held)} of {len(held)} intervals hold the truth.']) + '\n'
     print(text)
