@@ -241,7 +241,8 @@ def _is_misread_result(error: BaseException | None) -> bool:
     Dask reads the status of a call after its result has arrived. If the worker is lost in between, Dask
     unpacks the result as if it were type, exception and traceback (`_cascade_future` of its cfexecutor).
     """
-    frames = traceback.extract_tb(error.__traceback__) if isinstance(error, TypeError) else []
+    wrong = isinstance(error, (TypeError, ValueError))  # no three things, or another number of them
+    frames = traceback.extract_tb(error.__traceback__) if error is not None and wrong else []
     return bool(frames) and frames[-1].name == '_cascade_future'
 
 
