@@ -32,7 +32,7 @@ from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.score import PointErrors
 
 #: Two engines agree if their points of a trial are no further apart on average [m]: about the
-#: discretisation error of nodes and time step, 0.43 mm on the reference objects (doc/physics.md).
+#: discretisation error of nodes and time step, 0.46 mm on the reference objects (doc/physics.md).
 DISTANCE_TOLERANCE = 0.5e-3
 AMONG_OBSTACLES = 6.0  # times that; PyBullet's contact with them is off by 2 mm (doc/physics.md)
 

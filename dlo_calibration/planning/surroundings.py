@@ -28,7 +28,7 @@ MOST_CORNERS = 300  # that a search for a way looks from, at most
 MOST_BODIES = 40  # that a way goes around, at most: the nearest ones
 UPRIGHT = 0.7  # least vertical part of the direction in which a body is left by what lies on it
 SUNK = 2e-3  # m that a point of the DLO may be lower, or inside a body: noise
-OPEN = 4  # corners of a round outline for each of CORNERS, where it is drawn
+OPEN = 4  # corners of the rims of a cylinder for each of CORNERS
 
 
 def outline(obstacle: Obstacle, corners: int = OPEN * CORNERS, margin: float = 0.0) -> Floats:
