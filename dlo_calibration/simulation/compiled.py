@@ -146,7 +146,9 @@ class Engine:
 
 class CompiledSimulator(Engine, TogetherSimulator):
     """
-    Simulates trials on a table, in the air or among obstacles, about 60 times as fast as `bullet.BulletSimulator`.
+    Simulates trials on a table, in the air or among obstacles.
+
+    It is about 60 times as fast as `bullet.BulletSimulator`.
 
     Threads may share it.
 
