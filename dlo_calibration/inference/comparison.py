@@ -4,8 +4,8 @@
 """
 Comparison: whether two calibrations are of the same DLO, and which parameters have changed if not.
 
-Both posteriors are normal.  If the DLO is the same, the difference of their means is normal, too, with the sum
-of the covariances, and the square of its length in standard deviations has a chi-square distribution.
+Both posteriors are normal.  If the DLO is the same, the difference of their means is normal, too, with the
+sum of the covariances, and the square of its length in standard deviations has a chi-square distribution.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ class Comparison:
     The difference of d parameters between two calibrations, in the unit cube.
 
     :param change: (d,) later minus earlier values; `std` (d,) their standard deviations.
-    :param changed: (d,) True for the fewest parameters whose changes explain the difference; all but the first
-        are certain by themselves.
-    :param agreement: probability of a difference at least as large between calibrations of the same DLO; nan if
-        neither tells anything.
+    :param changed: (d,) True for the fewest parameters whose changes explain the difference; all but the
+        first are certain by themselves.
+    :param agreement: probability of a difference at least as large between calibrations of the same DLO;
+        nan if they tell nothing.
     """
 
     change: Floats
@@ -54,8 +54,8 @@ def compare(change: Floats, before: Floats, after: Floats) -> Comparison:
     """
     Compare two calibrations.
 
-    Directions of the unit cube in which the difference is hardly known do not count, so that EI and friction can
-    be compared where only both together are known.
+    Directions of the unit cube in which the difference is hardly known do not count, so that EI and friction
+    can be compared where only both together are known.
 
     :param change: (d,) later minus earlier values.
     :param before: (d, d) covariance of the earlier values; `after` (d, d) of the later ones.

@@ -56,7 +56,7 @@ def checked(file: Description, trials: Sequence[Trial], options: Options,
     """
     Compare the parameters that fit new trials with those of a result.
 
-    The search begins at the result, so that what the new trials do not show stays as it is.
+    The search begins at the result, among other points: what the new trials do not show stays as it is.
 
     :raises InputError: if the hands have lost the DLO in all trials.
     :raises SimulationError: if a trial cannot be simulated with the parameters of the result.
@@ -69,14 +69,14 @@ def checked(file: Description, trials: Sequence[Trial], options: Options,
     longer = validation.length / file.length - 1
     if abs(longer) > ANOTHER_LENGTH:
         return Check(validation, None, HAS_CHANGED, (
-            f'This is another DLO, or only a part of it is seen: it is {measured(validation.length, "m")} long, '
-            f'that of the result {measured(file.length, "m")}.',))
+            'This is another DLO, or only a part of it is seen: it is '
+            f'{measured(validation.length, "m")} long, that of the result {measured(file.length, "m")}.',))
     point, space = validation.best.point, validation.space
     # What these trials do not show keeps the value of the result.
-    space = replace(space, fixed={**space.fixed, **{name: file.parameters[name].value for name in space.free}})
+    space = replace(space, fixed={**space.fixed, **space.values(point)})
     with closing(make_simulator(options)) as simulator, closing(Threads(options.workers)) as threads:
         setting = Setting(tuple(trials), options, simulator, threads, should_stop)
-        search = LeastSquares(space.dimension, options.seed, Hints.at(point))
+        search = LeastSquares(space.dimension, options.seed, Hints(point, np.ones(len(point), np.bool_)))
         # The error of nodes and time step is much the same in both, and that of the result counts.
         there = examined(setting, fit(setting, space, search, budget(space.dimension)), discretised=False)
     if there.examination is None or not there.examination.regular:
@@ -107,9 +107,9 @@ def _judged(file: Description, validation: CalibrationResult, comparison: Compar
     names, length = validation.space.free, validation.length
     if error > max(FURTHER * file.errors.mean, SAME * length):
         return HAS_CHANGED, (
-            f'No parameter explains this session: at best, the simulated points are {measured(error, "m")} from '
-            f'the measured ones, {measured(file.errors.mean, "m")} in the calibration. It is another DLO or '
-            'frame, or a hand slipped.',)
+            'No parameter explains this session: at best, the simulated points are '
+            f'{measured(error, "m")} from the measured ones, {measured(file.errors.mean, "m")} '
+            'in the calibration. It is another DLO or frame, or a hand slipped.',)
     changes = _changes(file, validation, comparison)
     sure = 'less than 0.01 %' if comparison.agreement < 1e-4 else f'{number(100 * comparison.agreement)} %'
     chance = f'The same DLO would differ by as much in {sure} of such sessions.'
