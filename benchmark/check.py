@@ -149,9 +149,9 @@ def main() -> None:
     rows += [row('all', case, total[case]) for case in CASES]
     text = (f'# check\n\n`python benchmark/check.py --draws {options.draws} --noise {options.noise} '
             f'--objects {" ".join(map(str, options.objects))}`: four actions of each object, with '
-            f'new noise of {1e3 * options.noise:g} mm per coordinate in each session. In the rows of a change, '
-            'only checks whose sessions determine the changed parameter to 5 % each are counted as agrees, '
-            'changed or cannot tell.\n\n' + '\n'.join(rows) + '\n')
+            f'new noise of {1e3 * options.noise:g} mm per coordinate in each session. In the rows of a '
+            'change, only checks whose sessions determine the changed parameter to 5 % each are counted as '
+            'agrees, changed or cannot tell.\n\n' + '\n'.join(rows) + '\n')
     (HERE / 'results' / 'check.md').write_text(text, encoding='utf-8')
     print(*rows[-3:], sep='\n')
 
