@@ -111,7 +111,8 @@ def application(studio: Studio, events: Events, guard: Guard, token: str) -> web
             ('GET', '/api/photographs/{id}/picture', routes.picture),
             ('POST', '/api/lens', routes.set_lens), ('DELETE', '/api/lens', routes.remove_lens),
             ('GET', '/api/board/{paper}.pdf', routes.board), ('POST', '/api/calibrate', routes.calibrate),
-            ('POST', '/api/stop', routes.stop), ('GET', '/api/events', events.answer),
+            ('POST', '/api/check', routes.check), ('POST', '/api/stop', routes.stop),
+            ('GET', '/api/events', events.answer),
             ('GET', '/api/film/{number}', routes.film), ('GET', '/api/files/{name}', routes.file),
             ('GET', '/api/topics', routes.topics), ('POST', '/api/topics', routes.add_topic_image),
             ('POST', '/api/send', routes.send)):
@@ -183,6 +184,11 @@ class Routes:
     async def calibrate(self, request: web.Request) -> web.StreamResponse:
         """Begin to calibrate."""
         return await self._changed(partial(self._studio.calibrate, await _object(request)))
+
+    async def check(self, request: web.Request) -> web.StreamResponse:
+        """Compare the trials with a result."""
+        octets = await _octets(request, LARGEST_TEXT)
+        return await self._answer(partial(self._studio.check, octets, _name(request)))
 
     async def stop(self, request: web.Request) -> web.StreamResponse:
         """End the calibration with the best so far."""

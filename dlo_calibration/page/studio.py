@@ -20,6 +20,7 @@ from dlo_calibration.capture.trials import Drafter, Drafts, write_request, write
 from dlo_calibration.errors import InputError, suggestion
 from dlo_calibration.evaluation.digest import digest
 from dlo_calibration.files.chain_file import chain_csv, chain_xml
+from dlo_calibration.files.result import read_description
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.page.calibration import ProjectCalibration
 from dlo_calibration.page.film import film, film_motion
@@ -27,7 +28,9 @@ from dlo_calibration.page.graph import PageGraph
 from dlo_calibration.page.information import Information
 from dlo_calibration.simulation.motion import Motion
 from dlo_calibration.vision.photograph import jpeg, png
-from dlo_calibration.workspace.folder import FILES, REQUEST, SESSION
+from dlo_calibration.workspace.check import checked
+from dlo_calibration.workspace.folder import FILES, REQUEST, RESULT, SESSION
+from dlo_calibration.workspace.source import read_source, Selection
 from dlo_calibration.writing import make_folder, write_file
 
 MOST_FILMS = 8  # in memory
@@ -143,6 +146,21 @@ class Studio:
             return self.state()
 
     # The results
+
+    def check(self, octets: bytes, name: str) -> dict[str, Any]:
+        """
+        Return whether the trials still show the DLO of a result, and why, in sentences.
+
+        :param octets: the result file; `name` is only shown.
+        :raises InputError: if it cannot be read, or there is no complete trial.
+        """
+        file = read_description(octets, name or RESULT)
+        with self._lock:
+            self._information.pause()
+            session = self._write(SESSION, {})
+        source = read_source(Selection(session), lambda _: None, file.file_options).require_trials()
+        found = checked(file, source.trials, source.options, self._make_simulator)
+        return {'verdict': found.verdict, 'words': list(found.words)}
 
     def film(self, number: int, identity: str) -> dict[str, Any]:
         """
