@@ -231,7 +231,8 @@ def board_document(paper: str = 'a4') -> bytes:
     from matplotlib.backends.backend_pdf import PdfPages
 
     stream = io.BytesIO()
-    with PdfPages(stream, metadata={'CreationDate': None, 'Title': f'Board for {PAPERS[paper].name}'}) as pages:
+    metadata = {'CreationDate': None, 'Title': f'Board for {PAPERS[paper].name}'}
+    with PdfPages(stream, metadata=metadata) as pages:
         for figure in (board_figure(paper), tags_figure(paper)):
             pages.savefig(figure)
     return stream.getvalue()
@@ -263,10 +264,11 @@ def tags_figure(paper: str = 'a4') -> Any:
         _fill(axes, [(x, y, TAG_SIDE)], DARK)
         _fill(axes, [(x + across * cell, y + TAG_SIDE - (down + 1) * cell, cell)
                      for down, across in np.argwhere(tag_cells(number))], 'white')
-        axes.text(left + side / 2.0, bottom - 0.004, f'hand_{number + 1}', ha='center', va='center', fontsize=9)
+        axes.text(left + side / 2.0, bottom - 0.004, f'hand_{number + 1}', ha='center', va='center',
+                  fontsize=9)
     axes.text(sheet.width / 2.0, sheet.height - 0.06 - 2.0 * TAG_PITCH + 0.02,
-              'Cut out along the grey lines.  Glue each tag flat on what holds the DLO: a clothes peg, a pair\n'
-              'of tongs, a finger of a robot, so that the camera sees it while the hand moves.', ha='center',
+              'Cut out along the grey lines.  Glue each tag flat on what holds the DLO: a clothes peg, a\n'
+              'pair of tongs, a finger of a robot, so that the camera sees it while the hand moves.', ha='center',
               va='top', fontsize=9)
     return figure
 

@@ -102,8 +102,8 @@ def _aligned(grey: Pixels, number: int, corners: Floats) -> Floats:
     Psarakis, Parametric image alignment using enhanced correlation coefficient maximization, 2008): all
     edges between its cells count, and the brightness does not.
     """
-    printed = np.kron(np.pad(tag_cells(number), 1, constant_values=255), np.ones((CELL, CELL))).astype(np.float32)
-    template = cv2.GaussianBlur(printed, (0, 0), EDGE)
+    printed = np.kron(np.pad(tag_cells(number), 1, constant_values=255), np.ones((CELL, CELL)))
+    template = cv2.GaussianBlur(printed.astype(np.float32), (0, 0), EDGE)
     places = (1 + TAG_CELLS * np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)) * CELL - np.float32(0.5)
     reach = float(np.ptp(corners, axis=0).max()) / 3.0
     left, top = np.maximum(np.floor(corners.min(axis=0) - reach), 0).astype(int)
@@ -197,8 +197,9 @@ def tag_path(times: Sequence[float], poses: Mapping[int, TagPose]) -> TagPath:
             seen = instants[shown[piece]]
             inside = (instants >= seen[0]) & (instants <= seen[-1])
             smooth, turned = _smoothed(seen, places[piece], rotations[piece])
-            positions[inside] = np.stack([np.interp(instants[inside], seen, axis) for axis in smooth.T], axis=1)
-            turns[inside] = (Slerp(seen, turned)(instants[inside]) if len(seen) > 1 else turned).as_quat()
+            at = instants[inside]
+            positions[inside] = np.stack([np.interp(at, seen, axis) for axis in smooth.T], axis=1)
+            turns[inside] = (Slerp(seen, turned)(at) if len(seen) > 1 else turned).as_quat()
     return TagPath(instants, positions, turns)
 
 
