@@ -268,8 +268,8 @@ def tags_figure(paper: str = 'a4') -> Any:
                   fontsize=9)
     axes.text(sheet.width / 2.0, sheet.height - 0.06 - 2.0 * TAG_PITCH + 0.02,
               'Cut out along the grey lines.  Glue each tag flat on what holds the DLO: a clothes peg, a\n'
-              'pair of tongs, a finger of a robot, so that the camera sees it while the hand moves.', ha='center',
-              va='top', fontsize=9)
+              'pair of tongs, a finger of a robot, so that the camera sees it while the hand moves.',
+              ha='center', va='top', fontsize=9)
     return figure
 
 
