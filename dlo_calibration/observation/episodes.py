@@ -118,8 +118,13 @@ class _Hold:
     last: int
 
 
-def episodes(seen: Sightings, hands: Sequence[HandSightings]) -> tuple[tuple[Episode, ...], tuple[str, ...]]:
-    """Return the episodes of a film, and a sentence about each movement that makes none."""
+def episodes(seen: Sightings, hands: Sequence[HandSightings],
+             count: int | None = None) -> tuple[tuple[Episode, ...], tuple[str, ...]]:
+    """
+    Return the episodes of a film, and a sentence about each movement that makes none.
+
+    :param count: of points of their chains; None: as many as were seen.
+    """
     motion = _motion(seen)
     cut: list[Episode] = []
     problems: list[str] = []
@@ -129,14 +134,14 @@ def episodes(seen: Sightings, hands: Sequence[HandSightings]) -> tuple[tuple[Epi
     for before, (first, last), after in zip(bounds, movements, starts, strict=False):
         span = f'{seen.times[first]:.1f} to {seen.times[last]:.1f} s'
         try:
-            cut.append(_episode(seen, hands, motion, (before, first, last, after)))
+            cut.append(_episode(seen, hands, motion, (before, first, last, after), count))
         except InputError as error:
             problems.append(f'{span}: {error}')
     return tuple(cut), tuple(problems)
 
 
 def _episode(seen: Sightings, hands: Sequence[HandSightings], motion: Floats,
-             pictures: tuple[int, int, int, int]) -> Episode:
+             pictures: tuple[int, int, int, int], count: int | None) -> Episode:
     """
     Return the episode of one movement.
 
@@ -159,6 +164,7 @@ def _episode(seen: Sightings, hands: Sequence[HandSightings], motion: Floats,
                          'one on what moves it', 'glue a tag on what holds the DLO where it is seen, or '
                          'click the point that is held (--held)')
     closes, opens = min(hold.first for hold in holds), max(hold.last for hold in holds)
+    initial = Chain(_fewer(start, count))
     paths = [_path(seen, hold, initial) for hold in holds]
     settled = _between(times, max(times[opens], times[last]) + SPAN,
                        min(times[max(last, opens)] + SPAN + END, times[after]))
@@ -175,8 +181,16 @@ def _episode(seen: Sightings, hands: Sequence[HandSightings], motion: Floats,
     if not chains:
         raise InputError('movement', 'a DLO of which less than half is seen afterwards', 'the whole DLO',
                          'take the hand away after each movement')
+    chains = [(time, _fewer(points, count)) for time, points in (*goals, *chains)]
     return Episode(float(times[rest[0]]), chains[-1][0], initial, tuple(paths),
-                   tuple(hold.place for hold in holds), (*goals, *chains), len(goals))
+                   tuple(hold.place for hold in holds), tuple(chains), len(goals))
+
+
+def _fewer(points: Floats, count: int | None) -> Floats:
+    """Return `count` evenly spaced points of a chain (m, 3); NaN beside points that were not seen."""
+    if count is None or count == len(points):
+        return points
+    return _at(points, np.linspace(0.0, 1.0, count))
 
 
 def _between(times: Floats, begin: float, end: float) -> NDArray[np.intp]:
@@ -254,8 +268,12 @@ def _complete(points: Floats) -> Floats | None:
 
 def _at(points: Floats, places: Floats) -> Floats:
     """Return the points (p, 3) of a chain (m, 3) at shares (p,) of its length."""
-    rows = np.arange(float(len(points)))
-    return np.stack([np.interp(places * (len(points) - 1), rows, axis) for axis in points.T], axis=1)
+    at = places * (len(points) - 1)
+    below = np.minimum(np.floor(at + 1e-9).astype(int), len(points) - 1)
+    beyond = np.minimum(below + 1, len(points) - 1)
+    weight = np.clip(at - below, 0.0, 1.0)[:, None]
+    between = (1.0 - weight) * points[below] + weight * points[beyond]
+    return np.asarray(np.where(weight < 1e-6, points[below], between))  # not NaN for one beside it
 
 
 def _hold(seen: Sightings, hand: HandSightings, initial: Chain, motion: Floats, first: int,
