@@ -49,7 +49,8 @@ def main(path: str) -> NoReturn:
         answers.write(HEADER.pack(*decoder.size, decoder.frame_rate, decoder.duration))
         answers.flush()
         while len(request := requests.read(REQUEST.size)) == REQUEST.size:
-            decoder.answer(*REQUEST.unpack(request), answers)
+            begin, end = REQUEST.unpack(request)
+            decoder.answer(begin, end, answers)
     except OSError:  # the parent has closed the connection, or has ended
         pass
     os._exit(0)
@@ -132,10 +133,10 @@ class _Decoder:
 
     def _time(self) -> float:
         """Return the time of the frame that was grabbed [s]; damaged films may have none."""
-        time = self._film.get(self._cv2.CAP_PROP_POS_MSEC) / 1e3
+        time = float(self._film.get(self._cv2.CAP_PROP_POS_MSEC)) / 1e3
         if math.isfinite(time) and time > self._last:
-            return float(time)
-        return self._last + 1.0 / self.frame_rate if self._last > -math.inf else 0.0
+            return time
+        return float(self._last + 1.0 / self.frame_rate) if self._last > -math.inf else 0.0
 
     def _whole(self) -> float:
         """Return the duration of a film that does not say it [s]."""

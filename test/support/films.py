@@ -13,8 +13,8 @@ from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
-from photographs import _ground, _lay, _linear, GRAIN, Look, SKIN
 from photographs import _capsules as capsules_of
+from photographs import _ground, _lay, _linear, GRAIN, Look, SKIN
 
 FINENESS = 0.0003  # m of one pixel of the table
 SUB = 2  # pixels to a pixel of the picture, while lines are painted
