@@ -9,7 +9,7 @@ import argparse
 from itertools import chain, pairwise
 from pathlib import Path
 import time
-from typing import Any, Iterator, Sequence
+from typing import Any, cast, Iterator, Sequence
 
 import numpy as np
 
@@ -30,9 +30,10 @@ from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.episodes import Episode
 from dlo_calibration.vision.film import Film, read_film
 from dlo_calibration.vision.lens import read_lens
-from dlo_calibration.vision.observer import BoardWatch, drawn, FilmWriter, Observer, View
+from dlo_calibration.vision.observer import drawn, FilmWriter, Observer, View
 from dlo_calibration.vision.pose import scale_from_points
 from dlo_calibration.vision.scale import Scale
+from dlo_calibration.vision.view import BoardFinder, film_lens
 
 SESSION, TRACKED = 'session.mcap', 'tracked.mp4'
 FRAME = 'table'  # frame_id of the session
@@ -122,17 +123,17 @@ def _marks(text: str) -> list[tuple[float, float, float]]:
     return marks
 
 
-def _scale(chosen: argparse.Namespace, film: Source) -> Scale | BoardWatch | None:
+def _scale(chosen: argparse.Namespace, film: Source) -> Scale | BoardFinder | None:
     """Return the scale that the command line asks for."""
     lens = None if chosen.camera is None else read_lens(chosen.camera)
     if chosen.board:
-        return BoardWatch(None if lens is None else lens.resized(film.size))
+        return BoardFinder(film_lens(cast(Film, film)) if lens is None else lens.resized(film.size))
     if chosen.scale:
         return scale_from_points(*places_of(chosen.scale), film.size, lens)
     return None
 
 
-def _tracked(film: Source, clicks: Any, chosen: argparse.Namespace, scale: Scale | BoardWatch | None,
+def _tracked(film: Source, clicks: Any, chosen: argparse.Namespace, scale: Scale | BoardFinder | None,
              problems: list[str]) -> list[View]:
     """
     Return the views of all images, in the order of time; what goes wrong on the way ends it.

@@ -39,6 +39,7 @@ LIFTED = 0.008  # m above the table
 #: A beam that is lifted by its diameter leaves the table at 6 to 12 diameters to either side, and with the
 #: fourth root of the height farther away (see vision.axis.BUMP); a limp one hangs down.
 BUMP, SLACK = 12.0, 1.5
+TAG_ABOVE = 0.06  # m, from what a hand holds up to its tag, at most, where its grip is not yet known
 THIN, SHIFT = 0.1, 0.003  # s, m; goals of a DLO that moves lie at least so far apart
 START, END = 1.5, 2.5  # s of rest before and after a movement that are used at most
 FEWEST = 12  # chains of a rest, as for a stream of goals; fewer are given as their mean
@@ -403,6 +404,21 @@ def _path(seen: Sightings, hold: _Hold, initial: Chain) -> Hand:
     turns = np.tile(NO_ROTATION, (len(kept), 1)) if hold.hand.orientations is None else (
         hold.hand.orientations[kept])
     return Hand(hold.hand.name, (point,), seen.times[kept], places[kept], turns, offset, True)
+
+
+def without_lifted(points: Floats, tag: Floats, radius: float) -> Floats:
+    """
+    Return points (m, 3) [m] as one camera sees them, without those that a hand may hold in the air.
+
+    :param tag: (3,) where the tag of the hand is [m]; what it holds is nearer than TAG_ABOVE below it.
+    """
+    lifted = float(tag[2]) - TAG_ABOVE - radius
+    if not lifted > 0.0:
+        return points
+    reach = max(BUMP * 2.0 * radius, SLACK * lifted) + TAG_ABOVE
+    low = np.array(points)
+    low[np.linalg.norm(points[:, :2] - tag[:2], axis=1) <= reach] = np.nan
+    return low
 
 
 def _thinned(seen: Sightings, closes: int, opens: int) -> list[int]:

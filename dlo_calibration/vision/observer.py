@@ -1,16 +1,11 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Observer: what each image of a film shows: the DLO, where the camera is, and tags.
-
-The camera may move where the board is seen.  As long as the board's corners stay where they are in the image,
-the camera stands still, and its pose stays the same to the last digit.
-"""
+"""Observer: what each image of a film shows: the DLO, where the camera is, and tags."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, Mapping
 
@@ -21,90 +16,17 @@ from numpy.typing import ArrayLike
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.vision.axis import measured_diameter
-from dlo_calibration.vision.board import find_board
-from dlo_calibration.vision.lens import Lens
-from dlo_calibration.vision.photograph import Pixels
-from dlo_calibration.vision.pose import scale_from_points
+from dlo_calibration.vision.photograph import jpeg, MAXIMUM_PIXELS, Photograph, Pixels
 from dlo_calibration.vision.scale import Scale
 from dlo_calibration.vision.tags import tag_poses, TagFinder, TagPose
 from dlo_calibration.vision.tracer import LINE, OUTLINE, Trace
 from dlo_calibration.vision.tracker import COUNT, Tracked, Tracker
+from dlo_calibration.vision.view import BoardFinder
 
-STILL = 0.5  # px by which the corners of the board move at most, in the median, while the camera stands still
-REACH = 5  # px around a corner of the board in which it is looked for
-FEWEST = 12  # corners of the board that give the camera's pose
 WIDEST = 1280  # px, of an image with the line
 DARK = 12  # of 255; an image whose brightest hundredth is darker shows nothing
 BRIGHT_SHARE = 99.0  # percentile
 TAG_COLOUR = (60, 255, 60)
-
-
-class BoardWatch:
-    """
-    The scale of each image in which the board is seen.
-
-    :param lens: of the camera, calibrated; None: estimated from the first view.
-    :ivar seen: whether the board was seen in the last image; its last scale counts where it was not.
-    """
-
-    def __init__(self, lens: Lens | None = None) -> None:
-        self._lens = lens
-        self._scale: Scale | None = None
-        self._corners, self._places = np.zeros((0, 2)), np.zeros((0, 2))
-        self.seen = False
-
-    def scale(self, pixels: Pixels) -> Scale:
-        """
-        Return the scale of the next image.
-
-        :raises InputError: where the board has not been seen in any image so far.
-        """
-        if self._scale is None:
-            self._corners, self._places = find_board(pixels)
-            height, width = pixels.shape[:2]
-            self._scale = scale_from_points(self._corners, self._places, (width, height), self._lens)
-            self.seen = True
-            return self._scale
-        refined = _refined(pixels, self._corners)
-        shifts = np.linalg.norm(refined - self._corners, axis=1)
-        if np.mean(shifts < STILL) >= 0.4:  # a hand may cover the others
-            self.seen = True
-            return self._scale
-        view, near = cv2.findHomography(self._places, refined, cv2.RANSAC, 1.5)
-        inliers = np.zeros(0, bool) if view is None else near.ravel().astype(bool)
-        if inliers.sum() >= max(FEWEST, 0.5 * len(shifts)):
-            self._move(refined[inliers], self._places[inliers])
-            return self._scale
-        try:
-            self._move(*find_board(pixels))
-        except InputError:
-            self.seen = False
-        return self._scale
-
-    def _move(self, corners: Floats, places: Floats) -> None:
-        """Find the camera's pose anew; its lens stays the same."""
-        assert self._scale is not None
-        lens, scale = self._scale.lens, self._scale
-        flat = np.column_stack([places, np.zeros(len(places))])
-        self.seen, turn, move = cv2.solvePnP(
-            flat, lens.undistorted(corners), lens.matrix, None, cv2.Rodrigues(scale.rotation)[0],
-            scale.translation.reshape(3, 1).copy(), True, cv2.SOLVEPNP_ITERATIVE)
-        moved = replace(scale, rotation=cv2.Rodrigues(turn)[0], translation=move.ravel())
-        errors = np.linalg.norm(moved.points(corners)[:, :2] - places, axis=1)
-        self._scale = replace(moved, residuals=errors)
-        self._corners, self._places = corners, places
-
-
-def _refined(pixels: Pixels, corners: Floats) -> Floats:
-    """Return the corners (k, 2) [px] of black squares near those of the image before."""
-    grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
-    inside = np.all((corners > REACH + 2) & (corners < np.array(grey.shape[::-1]) - REACH - 3), axis=1)
-    refined = corners.copy()
-    if inside.any():
-        refined[inside] = cv2.cornerSubPix(
-            grey, corners[inside, None].astype(np.float32), (REACH, REACH), (-1, -1),
-            (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01))[:, 0]
-    return refined
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,12 +95,13 @@ class Observer:
     """
     Observes a DLO, the camera and tags from image to image, forwards or backwards in time.
 
-    :param scale: of all images; or a `BoardWatch`, which finds that of each; None: unknown.
+    :param scale: of all images; or a `BoardFinder`, which finds that of each; None: unknown.
     :param count: of points along the DLO.
     """
 
-    def __init__(self, scale: Scale | BoardWatch | None, count: int = COUNT) -> None:
+    def __init__(self, scale: Scale | BoardFinder | None, count: int = COUNT) -> None:
         self._given, self._tracker, self._finder = scale, Tracker(count), TagFinder()
+        self._last: Scale | None = None
         self._time = 0.0
 
     def start(self, time: float, pixels: Pixels, clicks: ArrayLike) -> View:
@@ -192,6 +115,10 @@ class Observer:
         """
         check_light(pixels)
         scale = self._scale(pixels)
+        if scale is None and self._given is not None:
+            raise InputError('board', 'none in the image in which the DLO is clicked',
+                             'the printed board beside the DLO', 'lay it flat beside the DLO, wholly in the '
+                             'picture, or begin at another instant')
         self._time = time
         return self._view(time, pixels, scale, self._tracker.start(pixels, clicks, scale))
 
@@ -202,7 +129,11 @@ class Observer:
         return self._view(time, pixels, scale, self._tracker.next(pixels, elapsed, scale))
 
     def _scale(self, pixels: Pixels) -> Scale | None:
-        return self._given.scale(pixels) if isinstance(self._given, BoardWatch) else self._given
+        if isinstance(self._given, BoardFinder):
+            # Where a hand hides the board for a moment, the camera is where it was.
+            self._last = self._given.next(pixels) or self._last
+            return self._last
+        return self._given
 
     def _view(self, time: float, pixels: Pixels, scale: Scale | None, tracked: Tracked) -> View:
         if scale is None:
@@ -249,6 +180,32 @@ def drawn(pixels: Pixels, view: View | None, widest: int = WIDEST) -> Pixels:
     for corners in view.tags.values():
         _polyline(picture, (corners + 0.5) * share - 0.5, TAG_COLOUR, 2, True)
     return picture
+
+
+def jpeg_of(pixels: Pixels) -> bytes:
+    """Return pixels (h, w, 3), red, green, blue, as a JPEG file."""
+    return jpeg(Photograph(pixels))
+
+
+def depths(thing: str, message: Any) -> Floats:
+    """
+    Return the depths (h, w) [m] of a `sensor_msgs/msg/Image`; 0 or NaN where unknown.
+
+    :param thing: what it is called in errors.
+    :raises InputError: for another encoding than 16UC1 [mm] or 32FC1 [m], or too few octets.
+    """
+    kinds = {'16UC1': ('u2', 0.001), '32FC1': ('f4', 1.0)}
+    if message.encoding not in kinds:
+        raise InputError(thing, f'encoding {message.encoding!r}', '16UC1 (mm) or 32FC1 (m)',
+                         'choose the topic of the aligned depth')
+    code, unit = kinds[message.encoding]
+    width, height, step = int(message.width), int(message.height), int(message.step)
+    octets, size = np.frombuffer(message.data, np.uint8), np.dtype(code).itemsize
+    if not 0 < width * height <= MAXIMUM_PIXELS or step < width * size or len(octets) < step * height:
+        raise InputError(thing, f'{width} x {height} depths in {len(octets)} octets, {step} a row',
+                         'all rows', 'check the driver of the camera')
+    rows = np.ascontiguousarray(octets[:step * height].reshape(height, step)[:, :width * size])
+    return rows.view(('>' if message.is_bigendian else '<') + code).astype(float) * unit
 
 
 def _polyline(picture: Pixels, line: Floats, colour: tuple[int, int, int], thick: int, closed: bool) -> None:

@@ -180,3 +180,12 @@ def _lens_of(views: list[tuple[Floats, Floats]], size: tuple[int, int]) -> Lens:
 
     solution = least_squares(errors, np.concatenate(start), method='lm', x_scale='jac')
     return lens(solution.x[:2])
+
+
+def first_lens(pixels: Pixels, printed: float = RULER) -> Lens:
+    """
+    Return the lens of a camera from one view of the board.
+
+    :raises InputError: where the board is not seen.
+    """
+    return _lens_of([find_board(pixels, printed)], (pixels.shape[1], pixels.shape[0]))

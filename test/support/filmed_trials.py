@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from dlo_calibration import Action, Chain, Goal, Hand, Trial
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.simulation.compiled import CompiledSimulator
-from dlo_calibration.vision.tags import QUIET, tag_cells, TAG_CELLS, TAG_SIDE
+from dlo_calibration.vision.tags import QUIET, TAG_CELLS, tag_cells, TAG_SIDE
 
 LENGTH, RADIUS, MASS = 0.6, 0.004, 0.03  # m, m, kg
 TRUTH = {'flexibility': 60.0, 'elasticity': 40.0, 'friction': 65.0, 'self_collision': 25.6, 'damping': 50.0}
@@ -68,7 +68,8 @@ class FilmedTrials:
     def tag(self, k):
         """Return the middle (3,) [m] and the rotation (3, 3) of the tag in image k."""
         rotation = Rotation.from_euler('zx', [self.turns[k], 25.0], degrees=True).as_matrix()
-        return self.grips[k] + Rotation.from_euler('z', self.turns[k], degrees=True).apply(GRIP_TO_TAG), rotation
+        above = Rotation.from_euler('z', self.turns[k], degrees=True).apply(GRIP_TO_TAG)
+        return self.grips[k] + above, rotation
 
     def instant(self, k, camera):
         """Return what image k shows."""
@@ -137,7 +138,8 @@ def filmed_trials(moves=MOVES, rate=RATE, truth=None, seed=0):
         holds.append((now / rate + closes, now / rate + opens, move.grip))
         now += len(times)
         points = chains[-1]
-    return FilmedTrials(np.arange(now) / rate, np.array(curves), np.array(grips), np.array(turns), tuple(holds))
+    return FilmedTrials(np.arange(now) / rate, np.array(curves), np.array(grips), np.array(turns),
+                        tuple(holds))
 
 
 def clicks(film, camera, count=4, seed=0):
