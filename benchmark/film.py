@@ -4,8 +4,7 @@
 """
 Track DLOs in rendered films whose truth is known, and compare.
 
-A film shows a simulated rope and a hand with a tag that moves it, at 1920 x 1080 pixels and 30 images a second,
-with shadows, blur, noise and compression; in two of ten, the camera is held in the hand.
+A film shows a simulated rope and a hand that moves it, at 1920 x 1080 pixels and 30 images a second, with shadows, blur, noise and compression; in two of ten, the camera is held in the hand.
 
     python benchmark/film.py [FILMS] [SECONDS]
 
@@ -22,7 +21,6 @@ import tempfile
 import time
 from typing import Any, Iterator, Sequence
 
-import cv2
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
@@ -30,7 +28,7 @@ from scipy.spatial import cKDTree
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent / 'test' / 'support'))
 
-from films import Instant, Renderer, Tag, write_film  # noqa: E402
+from films import Instant, Renderer, write_film  # noqa: E402
 from laid_board import LaidBoard  # noqa: E402
 from photographs import Camera, Hand, Look  # noqa: E402
 
@@ -64,7 +62,8 @@ LOOKS = (
 ACTIONS: tuple[tuple[NamedAction, ...], ...] = (
     (Drag(fraction=0.4, direction=(0.1, 1, 0), distance=0.12),
      GraspAndPlace(fraction=1.0, direction=(-0.1, 0.12, 0), distance=0.156, height=0.1)),
-    (Drag(fraction=1.0, direction=(-1, 1, 0), distance=0.18), Drag(fraction=0.5, direction=(0, -1, 0), distance=0.1)),
+    (Drag(fraction=1.0, direction=(-1, 1, 0), distance=0.18),
+     Drag(fraction=0.5, direction=(0, -1, 0), distance=0.1)),
     (GraspAndPlace(fraction=0.0, direction=(1.0, 0.5, 0), distance=0.2, height=0.06),
      Drag(fraction=0.7, direction=(0.2, -1, 0), distance=0.12)),
     (Drag(fraction=0.0, direction=(1, -0.8, 0), distance=0.2),
@@ -135,8 +134,8 @@ def _moved(points: Floats, named: NamedAction,
     times = np.arange(1, round((hand.end + SETTLE) * RATE) + 1) / RATE
     simulator = make_simulator(options)
     values = options.space.physical({**PARAMETERS, 'flexibility': flexibility}, LENGTH)
-    chains = simulator.simulate(Trial(named.name, chain, (action,),
-                                      tuple(Goal(chain, float(time), stable=False) for time in times)), values).chains
+    goals = tuple(Goal(chain, float(time), stable=False) for time in times)
+    chains = simulator.simulate(Trial(named.name, chain, (action,), goals), values).chains
     simulator.close()
     places = np.column_stack([np.interp(times, hand.times, axis) for axis in np.asarray(hand.positions).T])
     return list(chains), list(places), [bool(hand.times[0] <= time <= hand.end) for time in times]

@@ -143,7 +143,7 @@ class _Decoder:
         while self._film.grab():
             self._watch()
             self._last = self._time()
-        return self._last + 1.0 / self.frame_rate
+        return float(self._last + 1.0 / self.frame_rate)
 
     def _watch(self) -> None:
         """End the process later, unless this is called again before."""

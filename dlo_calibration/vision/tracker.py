@@ -7,7 +7,7 @@ Tracker: follows a DLO from image to image.
 The tracer finds the line in the first image.  In each further one the line is expected where it moved to;
 beside it, strips of the image say where it is now (`middle_line`); the elastic line through these places
 (`elastic`) keeps its length, and bridges what is hidden.  At last the image is compared with the line: what
-does not look like the DLO is not seen, and a line that explains too little, or leaves too much unexplained, is
+does not look like the DLO is not seen; a line that explains too little, or leaves too much unexplained, is
 lost.
 """
 
@@ -47,7 +47,7 @@ from dlo_calibration.vision.tracer import Tracer
 Bools = NDArray[np.bool_]
 
 COUNT = 61  # points along the DLO
-STATIONS = (60, 200)  # of the line that is tracked, at least and at most
+STATIONS = (60, 130)  # of the line that is tracked, at least and at most
 STATION = 0.9  # half widths between them
 FAR = (9.0, 4.0, 2.4)  # half widths: how far each of the strips reaches beside the line
 WIDER = 16.0  # the same of the first one, after the DLO was lost
@@ -68,7 +68,8 @@ APART = 0.6  # half widths between the line and where the image shows it, from w
 LEAST = 0.3  # share of the line that must be seen
 UNEXPLAINED = 0.06  # of the DLO's area: more of its colour elsewhere, near the line, is too much
 DAMPED = 0.7  # of the velocity that remains
-REDUCED = 480.0  # px, longer side of the picture in which colours are counted
+REDUCED = 4.0  # px, width of the DLO in the picture in which colours are counted
+ALIKE = 0.7  # logarithm of the odds from which on a pixel there has the DLO's colour
 SEARCHES = 10  # images from one search of the whole picture to the next
 WRONG_LENGTH = 0.05  # share of the length by which a line that is found again may differ
 
@@ -164,7 +165,7 @@ class Tracker:
                 self._line = replace(self._line, line=moved)
         self._scale = scale
         before = self._line.line
-        found = self._followed(pixels, before + self._velocity * elapsed, FAR[0] if not self._lost_for else WIDER)
+        found = self._followed(pixels, before + self._velocity * elapsed, WIDER if self._lost_for else FAR[0])
         reason = self._doubt(pixels, found)
         if reason and self._lost_for % SEARCHES == SEARCHES - 1:
             again = self._searched(pixels)
@@ -185,7 +186,7 @@ class Tracker:
 
     def _tracked(self) -> Tracked:
         place = np.linspace(0, len(self._line.line) - 1, self._count)
-        points = along_line(self._line.line, np.arange(len(self._line.line)), place)
+        points = along_line(self._line.line, np.arange(float(len(self._line.line))), place)
         low, high = np.floor(place).astype(int), np.ceil(place).astype(int)
         points[~(self._line.seen[low] & self._line.seen[high])] = np.nan
         return Tracked(points, self._width())
@@ -211,7 +212,7 @@ class Tracker:
         for stage, (reach, step, sigma) in enumerate(zip((far, *FAR[1:]), STEPS, SIGMA, strict=True)):
             fineness = self._finenesses(line)
             half = self._half * np.append(fineness, fineness[-1])
-            offsets = np.arange(-round(reach / step), round(reach / step) + 1) * step
+            offsets = step * np.arange(-float(round(reach / step)), round(reach / step) + 1)
             strip = straighten(pixels, line, half, offsets)
             index, quality = self._places(strip, stage, line, half)
             chosen = offsets[index]
@@ -256,10 +257,11 @@ class Tracker:
     @staticmethod
     def _without_others(logarithms: Singles, strip: Any, line: Floats, half: Floats) -> None:
         """Take the colours of other strands of the DLO out of a strip."""
-        count = len(line)
         reach = float(np.abs(strip.offsets).max() + 1.5) * half
         distance = np.linalg.norm(line[:, None] - line, axis=2)
-        apart = np.abs(np.arange(count)[:, None] - np.arange(count)) > 5
+        arc = arc_lengths(line)
+        # Another strand is much farther along the line than through the air.
+        apart: Bools = np.abs(arc[:, None] - arc) > 2.0 * distance + 4.0 * half[:, None]
         for row in np.flatnonzero((apart & (distance < reach[:, None])).any(axis=1)):
             others = line[apart[row] & (distance[row] < reach[row])]
             at = strip.line[row] + (strip.offsets * strip.half[row])[:, None] * strip.normals[row]
@@ -327,8 +329,8 @@ class Tracker:
             # A part in the air looks longer: it is one that moves, or is hidden.
             normals = np.column_stack([-directions(line)[:, 1], directions(line)[:, 0]])
             change = np.abs(((fit - self._line.line) * normals).sum(axis=1))
-            moving = gaussian_filter1d(((change > MOVES * half) | (across < across.max() * 0.1)).astype(float),
-                                       3.0, mode='nearest')
+            loose = (change > MOVES * half) | (across < 0.1 * across.max())
+            moving = gaussian_filter1d(loose.astype(float), 3.0, mode='nearest')
             still = np.where(moving > 0.05, known.along, 1.0 / (STILL * half) ** 2)
             fit = fitted(fit, replace(known, along=still, ends=places, end_weights=weights))
         return fit, (True, True), excess
@@ -347,29 +349,26 @@ class Tracker:
             return 'the DLO is also where the line is not: move it slowly, or start again with new clicks'
         return ''
 
-    def _mask(self, pixels: Pixels) -> tuple[Bools, float]:
-        """Return where the picture, reduced, has the DLO's colour, and by what it was reduced."""
-        height, width = pixels.shape[:2]
-        factor = max(1.0, min(max(height, width) / REDUCED, self._width() / 4.0))
-        small: Any = cv2.resize(pixels, (round(width / factor), round(height / factor)),
-                                interpolation=cv2.INTER_AREA)
-        lab: Any = cv2.cvtColor(small.astype(np.float32) / np.float32(255), cv2.COLOR_RGB2Lab)
-        return odds(self._table, lab) > 0.7, factor
+    def _mask(self, pixels: Pixels) -> tuple[Bools, int]:
+        """Return where a part of the picture, reduced, has the DLO's colour, and by what it was reduced."""
+        factor = max(1, int(self._width() / REDUCED))
+        lab: Any = cv2.cvtColor(pixels[::factor, ::factor].astype(np.float32) / np.float32(255),
+                                cv2.COLOR_RGB2Lab)
+        return np.asarray(odds(self._table, lab) > ALIKE), factor
 
     def _unexplained(self, pixels: Pixels, line: Floats) -> float:
         """Return the area with the DLO's colour that is not near the line, as a share of the DLO's area."""
-        mask, factor = self._mask(pixels)
-        width = self._width() / factor
+        height, width = pixels.shape[:2]
+        thick = self._width()
+        low = np.clip(line.min(axis=0) - 6 * thick, 0, (width - 2, height - 2)).astype(int)
+        high = np.clip(line.max(axis=0) + 6 * thick, low + 2, (width, height)).astype(int)
+        mask, factor = self._mask(pixels[low[1]:high[1], low[0]:high[0]])
         covered = np.zeros(mask.shape, np.uint8)
-        points = np.rint(((line + 0.5) / factor - 0.5) * 16).astype(np.int32)
-        cv2.polylines(covered, [points], False, 1, round(2.2 * width + 2), cv2.LINE_8, 4)
-        low = np.maximum(((line.min(axis=0)) / factor - 8 * width).astype(int), 0)
-        high = np.maximum(((line.max(axis=0)) / factor + 8 * width).astype(int), 1)
-        part = slice(low[1], high[1]), slice(low[0], high[0])
-        elsewhere = cv2.morphologyEx((mask & (covered == 0))[part].astype(np.uint8), cv2.MORPH_OPEN,
-                                     np.ones((2, 2), np.uint8)) if mask[part].size else np.zeros(1)
-        area = width * arc_lengths(line)[-1] / factor
-        return float(elsewhere.sum() / max(area, 1.0))
+        points = np.rint((line - low) / factor * 16).astype(np.int32)
+        cv2.polylines(covered, [points], False, 1, round(2.2 * thick / factor + 2), cv2.LINE_8, 4)
+        elsewhere = (mask & (covered == 0)).astype(np.uint8)
+        elsewhere = np.asarray(cv2.morphologyEx(elsewhere, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8)))
+        return float(elsewhere.sum()) * factor ** 2 / max(thick * float(arc_lengths(line)[-1]), 1.0)
 
     def _searched(self, pixels: Pixels) -> _Line | None:
         """Return the line found anywhere in the picture; None: there is none that is sure."""
@@ -382,7 +381,7 @@ class Tracker:
         path = _longest(u, v, mask)
         if len(path) < 8:
             return None
-        rough = (path + 0.5) * factor - 0.5
+        rough = path * factor
         if np.linalg.norm(rough[0] - self._line.line[0]) + np.linalg.norm(rough[-1] - self._line.line[-1]) > (
                 np.linalg.norm(rough[0] - self._line.line[-1])
                 + np.linalg.norm(rough[-1] - self._line.line[0])):

@@ -92,7 +92,7 @@ class BoardFinder:
         start = (self._corners - low).astype(np.float32)[:, None]
         places: Any
         places, found, _ = cv2.calcOpticalFlowPyrLK(
-            before[part], now[part], start, None, winSize=WINDOW, maxLevel=2)  # type: ignore[call-overload]
+            before[part], now[part], start, None, winSize=WINDOW, maxLevel=2)
         corners = places[:, 0].astype(float) + low
         kept = found[:, 0] > 0
         if kept.sum() < FEWEST_CORNERS:

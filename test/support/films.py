@@ -4,9 +4,9 @@
 """
 Films: renders images of a DLO that moves, of which everything is known.
 
-It shows what `photographs` shows, thirty times as fast: the ground is one picture of the table, seen through a
-homography; a DLO and hands are thick lines, painted from the lowest to the highest.  The camera's lens has no
-distortion.
+It shows what `photographs` shows, several times as fast: the ground is one picture of the table, seen through
+a homography; a DLO and hands are thick lines, painted from the lowest to the highest.  The camera's lens has
+no distortion.
 """
 
 from dataclasses import dataclass, field, replace
