@@ -131,9 +131,8 @@ def main():
             break
         robot.execute(heard['/planner/action'])
         away = np.linalg.norm(robot.points - goal, axis=1).mean()
-        log.info(f'the rope is {1e3 * away:.1f} mm from the goal; tracked in {status("tracker", "tracked")} of '
-                 f'{status("tracker", "images")} images')
-    robot.pool.close()
+        log.info(f'the rope is {1e3 * away:.1f} mm from the goal; tracked in '
+                 f'{status("tracker", "tracked")} of {status("tracker", "images")} images')
     rclpy.try_shutdown()
     return 0
 
