@@ -110,7 +110,8 @@ def main(arguments=None):
                 if found[name]['identifiable']}
         inside = sum(lower <= right <= upper for right, _, lower, upper in rows.values())
         held, asked = held + inside, asked + len(rows)
-        print(json.dumps({'object': number, 'identifiable': rows, 'mean_error_mm': 1e3 * result['mean_error_m'],
+        print(json.dumps({'object': number, 'identifiable': rows,
+                          'mean_error_mm': 1e3 * result['mean_error_m'],
                           'intervals_that_hold': f'{held} of {asked}'}), flush=True)
     return 0
 
