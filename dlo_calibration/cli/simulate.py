@@ -130,7 +130,7 @@ def _show(predictions: Named, options: Options, simulator: Simulator) -> None:
     :raises DloCalibrationError: if no window can be opened.
     """
     from dlo_calibration.report.drawing import hand_colours
-    from dlo_calibration.simulation.window import Film, FRAME_RATE, MOST_FRAMES, show
+    from dlo_calibration.simulation.window import Scenario, FRAME_RATE, MOST_FRAMES, show
 
     radius, films, levels = predictions[0][1].physical['self_collision'], [], []
     for name, prediction in predictions:
