@@ -30,8 +30,7 @@ BESIDE_CLAMP = 1.5  # widths of the DLO: so near to a clamp, its edges disturb t
 DEGREE = 4  # of that curve; a lower one bends too little, so that the clamp's direction is off by degrees
 FEWEST = 10  # points that determine it
 ABOVE_TABLE = 1.0  # m, height of the lowest point, so that no table touches it
-#: Of a simulated DLO, so that it bends beside its clamps as a real one: with 41, EI of a loop whose weight is
-#: 800 times EI / length^3 is 10 % too large, with these 2 % (test/capture/test_hanging.py).
+#: Of a simulated DLO: it bends most beside its clamps, where a coarser one is stiffer than the real one is.
 NODES = 121
 REST = 5.0  # s after which the simulated DLO is looked at
 

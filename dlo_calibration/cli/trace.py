@@ -22,10 +22,8 @@ from dlo_calibration.capture.trials import write_session
 from dlo_calibration.cli.output import print_json, standard_output
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.chain_file import write_chain
-from dlo_calibration.files.session import read_session
 from dlo_calibration.model.chain import Chain, Floats, MOST_POINTS
 from dlo_calibration.model.parameters import BY_NAME, SCALE
-from dlo_calibration.model.trial import Trial
 from dlo_calibration.vision.axis import axis_of, measured_diameter
 from dlo_calibration.vision.board import find_board
 from dlo_calibration.vision.lens import read_lens
@@ -40,7 +38,7 @@ COUNTS = (3, MOST_POINTS)  # of a chain's points
 COUNT, HANGING_COUNT = 21, 41  # of these, if the user does not say
 FEWEST_HANGING = 9  # points of a chain that hangs, four of which are in the clamps
 LARGEST_MASS = 1000.0  # kg
-ONLY_HANGING = {'clamps': '--clamps', 'plumb': '--plumb', 'mass': '--mass', 'repeats': '--repeats'}
+ONLY_HANGING = {'clamps': '--clamps', 'plumb': '--plumb', 'mass': '--mass'}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -67,9 +65,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                              'photograph; with --scale, y points up)')
     parser.add_argument('--mass', type=float, metavar='KG',
                         help='of the DLO that hangs, from clamp to clamp [kg]; recorded with the trial')
-    parser.add_argument('--repeats', metavar='SESSION', type=Path,
-                        help='what --output wrote for other photographs of the DLO that hangs: its trials '
-                             'are written, too')
     parser.add_argument('--camera', metavar='FILE', type=Path,
                         help='YAML of a ROS camera calibration, against lens distortion')
     parser.add_argument('--count', type=int, metavar='N',
@@ -84,7 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     """Execute the verb; return the exit code."""
-    clicks = _pixels(chosen.points, '--points')
+    clicks = pixels_of(chosen.points, '--points')
     _check(chosen)
     photograph = read_photograph(chosen.photograph, f'photograph {chosen.photograph}')
     begin = time.perf_counter()
@@ -123,14 +118,18 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     return 0
 
 
+def check_count(count: int, fewest: int = COUNTS[0]) -> None:
+    """Refuse a number of points that no chain has."""
+    if not fewest <= count <= COUNTS[1]:
+        raise InputError('--count', str(count), f'{fewest} to {COUNTS[1]}', 'choose a number')
+
+
 def _check(chosen: argparse.Namespace) -> None:
     """Refuse values that are out of range, and those without what they need; complete the count."""
     hangs, scaled = chosen.hanging is not None, _has_scale(chosen)
     if chosen.count is None:
         chosen.count = HANGING_COUNT if hangs else COUNT
-    fewest = FEWEST_HANGING if hangs else COUNTS[0]
-    if not fewest <= chosen.count <= COUNTS[1]:
-        raise InputError('--count', str(chosen.count), f'{fewest} to {COUNTS[1]}', 'choose a number')
+    check_count(chosen.count, FEWEST_HANGING if hangs else COUNTS[0])
     if chosen.diameter is not None and not 0 < chosen.diameter <= LARGEST_DIAMETER:
         raise InputError('--diameter', f'{chosen.diameter:g} m', f'above 0, at most {LARGEST_DIAMETER:g} m',
                          'give it in metres')
@@ -165,12 +164,7 @@ def _scale(chosen: argparse.Namespace, photograph: Photograph, trace: Trace) -> 
     if chosen.board:
         pixels, table = find_board(photograph.pixels)
     elif chosen.scale:
-        pairs = [word.partition('=') for word in chosen.scale.split()]
-        for pair in pairs:
-            if not pair[1]:
-                raise InputError('--scale', repr(pair[0]), 'u,v=x,y',
-                                 'write e.g. "100,200=0,0 900,210=0.3,0 ..."')
-        pixels, table = (np.array([_pair(pair[k], '--scale', 'u,v=x,y') for pair in pairs]) for k in (0, 2))
+        pixels, table = places_of(chosen.scale)
     else:
         return None
     return scale_from_points(pixels, table, photograph.size, lens, photograph.focal_length)
@@ -190,19 +184,25 @@ def _write(chosen: argparse.Namespace, chain: Chain, diameter: float) -> None:
     if chosen.output.suffix.lower() != '.mcap':
         write_chain(chosen.output, chain)
         return
-    others: tuple[Trial, ...] = ()
-    mass = 0.0 if chosen.mass is None else with_ends(chosen.mass)
-    if chosen.repeats is not None:
-        session = read_session(chosen.repeats)
-        others, mass = session.trials, mass or session.options.mass
     radius = BY_NAME['self_collision'].value(diameter / 2)
-    options = {'mass': mass, 'nodes': NODES, 'self_collision': min(max(radius, 0.0), SCALE)}
-    trial = hanging_trial(f'trial {len(others) + 1}', chain)
-    write_session(chosen.output, [*others, trial], Options.of(options).flat())
+    options = {'mass': 0.0 if chosen.mass is None else with_ends(chosen.mass), 'nodes': NODES,
+               'self_collision': min(max(radius, 0.0), SCALE)}
+    write_session(chosen.output, [hanging_trial('trial 1', chain)], Options.of(options).flat())
 
 
-def _pixels(text: str, option: str) -> Floats:
-    """Return the pixels (k, 2) of an option."""
+def places_of(text: str) -> tuple[Floats, Floats]:
+    """Return pixels (k, 2) and places on the table (k, 2) [m] of the option --scale."""
+    pairs = [word.partition('=') for word in text.split()]
+    for pair in pairs:
+        if not pair[1]:
+            raise InputError('--scale', repr(pair[0]), 'u,v=x,y',
+                             'write e.g. "100,200=0,0 900,210=0.3,0 ..."')
+    pixels, table = (np.array([_pair(pair[k], '--scale', 'u,v=x,y') for pair in pairs]) for k in (0, 2))
+    return pixels, table
+
+
+def pixels_of(text: str, option: str) -> Floats:
+    """Return the pixels (k, 2) of an option "u,v u,v ..."."""
     return np.array([_pair(word, option, 'u,v') for word in text.split()]).reshape(-1, 2)
 
 
@@ -210,7 +210,7 @@ def _two(text: str | None, option: str) -> Floats | None:
     """Return the two pixels (2, 2) of an option; None: it is not given."""
     if text is None:
         return None
-    pixels = _pixels(text, option)
+    pixels = pixels_of(text, option)
     if len(pixels) != 2:
         raise InputError(option, f'{len(pixels)} pixels', 'two', 'write "u,v u,v"')
     return pixels

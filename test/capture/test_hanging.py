@@ -91,29 +91,19 @@ def test_without_clicks_in_the_clamps_the_line_gives_their_direction(tmp_path):
         assert np.degrees(np.arctan2(into[1], side * into[0])) == pytest.approx(30.0, abs=2.5)
 
 
-@pytest.fixture
-def repeats(tmp_path):
-    """Return the trials and options of two photographs of one loop, without clicks in the clamps."""
-    first, both = tmp_path / 'first', tmp_path / 'both'
-    for folder in (first, both):
-        folder.mkdir()
-    one, _ = traced(first, view(), '--length', str(LENGTH))
-    two, options = traced(both, view(roll=0.01), '--length', str(LENGTH), '--repeats',
-                          str(first / 'loop.mcap'), off=4.0)
-    np.testing.assert_allclose(two[0].initial.points, one[0].initial.points, atol=1e-6)
-    return two, options
-
-
-def test_several_photographs_of_a_loop_are_repeats_in_one_session(repeats):
-    trials, options = repeats
-    assert [trial.name for trial in trials] == ['trial 1', 'trial 2']
-    assert 0 < np.abs(trials[0].initial.points - trials[1].initial.points).max() < 0.01
-    assert options.mass == pytest.approx(MASS, rel=0.02)
-
-
 @pytest.mark.long
-def test_repeats_give_the_stiffness(repeats):
-    assert fitted(*repeats).physical_value == pytest.approx(BENDING, rel=0.15)
+def test_sessions_of_several_photographs_are_fitted_together(tmp_path, capsys):
+    sessions = []
+    for number in range(2):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        traced(folder, view(roll=0.01 * number), '--length', str(LENGTH), off=4.0 * number)
+        sessions.append(str(folder / 'loop.mcap'))
+    capsys.readouterr()
+    assert main(['fit', *sessions, '--calibrate', 'flexibility', '--json', '--workers', '1']) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed['trials'] == 2
+    assert printed['parameters']['flexibility']['physical_value'] == pytest.approx(BENDING, rel=0.15)
 
 
 def test_a_camera_that_is_turned_is_told_by_a_plumb_line(tmp_path):
