@@ -3,6 +3,7 @@
 
 """Films on the capture page: from a file to trials, by HTTP and in a real browser."""
 
+
 from browser import browser, Tab
 from capture_page import served
 from filmed_trials import clicks, film_camera, filmed_trials, LENGTH, MASS, Move
