@@ -56,16 +56,18 @@ DRIFT = 0.15
 SIGMA = (0.5, 0.3, 0.1)  # half widths: standard deviation of the places that each of them gives
 STRETCH = 0.05  # of a segment's length: standard deviation; a part in the air looks longer
 BEND = 0.01  # half widths, standard deviation of a change of second differences from image to image
-FREE = 2.0  # half widths, standard deviation of the place where the line is expected
+FREE = (10.0, 1.5)  # half widths, deviation from where the line is expected: if an end is seen, or none
 STILL = 0.02  # the same along a part that does not move, while another part is in the air
 END = 0.15  # half widths, standard deviation of an end
 MOVES = 0.12  # half widths from image to image, from which on a part moves
 TOLERANCE = 0.006  # share of the length on a table that a line between two visible ends may lack
 UNSCALED = 0.04  # the same in a picture without a scale
+BLURRED = 3.0  # px that it may lack besides, as ends are blurred
 BEYOND = 6.0  # half widths behind the last part that looks like the DLO, from which on its end is looked for
 LONGEST_TIP = 14  # half widths by which the line may be too short
 FAN = np.radians(np.arange(-50.0, 51.0, 10.0))  # directions in which the DLO may go on
 REACHES = np.array([0.4, 0.8, 1.2, 1.6])  # half widths, where colours are read in each of them
+OTHERS = 5e-4  # share of each colour, e.g. of 2000 colours of hands: a rare colour of the DLO may be theirs
 SEEN = 0.35  # mean logarithm of the odds of a colour from which on the DLO is seen
 SIDES = np.array([-2.6, -2.2, -1.8, 1.8, 2.2, 2.6])  # half widths beside the DLO, where the ground is seen
 STRANGE = 16.0  # distance in L, a, b of what is behind an end, from which on it is probably covered
@@ -75,7 +77,7 @@ UNEXPLAINED = 0.06  # of the DLO's area: more of its colour elsewhere than usual
 ADAPTED = 0.05  # share by which what is usual follows each image
 DAMPED = 0.7  # of the velocity that remains
 REDUCED = 4.0  # px, width of the DLO in the picture in which colours are counted
-ALIKE = 1.2  # mean logarithm of the odds from which on a place there has the DLO's colour
+ALIKE = 0.75  # share of the DLO's usual logarithm of the odds from which on a place there has its colour
 SEARCHES = 10  # images from one search of the whole picture to the next
 WRONG_LENGTH = 0.05  # share of the length by which a line that is found again may differ
 
@@ -149,7 +151,9 @@ class Tracker:
         self._length = float(arc[-1])
         self._half = half / float(np.median(self._finenesses(line)))  # in units of the length
         strip = straighten(pixels, line, np.full(count, half), np.arange(-2.4, 2.41, 0.08))
-        self._table = learn_colours(strip, 0.5, (1.4, 2.4))
+        self._table = learn_colours(strip, 0.5, (1.4, 2.4), OTHERS)
+        middle = straighten(pixels, line, np.full(count, half), np.linspace(-0.4, 0.4, 5))
+        self._alike = ALIKE * float(np.median(odds(self._table, middle.lab).mean(axis=1)))
         self._line = _Line(line, np.interp(np.linspace(0, 1, count), np.linspace(0, 1, len(trace.sure)),
                                            trace.sure) > 0.5, (True, True), 0.0)
         self._velocity: Floats = np.zeros_like(line)
@@ -345,10 +349,11 @@ class Tracker:
         count = len(line)
         lengths = self._length / (count - 1) * fineness
         known = Evidence(
-            measured, across, expected, np.full(count, 1.0 / (FREE * half) ** 2), 0.2 / (FREE * half) ** 2,
-            lengths, 1.0 / (STRETCH * float(lengths.mean())) ** 2, 1.0 / (BEND * half) ** 2, np.zeros((2, 2)),
-            np.zeros(2))
+            measured, across, expected, np.full(count, 1.0 / (FREE[0] * half) ** 2),
+            0.2 / (FREE[0] * half) ** 2, lengths, 1.0 / (STRETCH * float(lengths.mean())) ** 2,
+            1.0 / (BEND * half) ** 2, np.zeros((2, 2)), np.zeros(2))
         tolerance = UNSCALED if self._scale is None else TOLERANCE
+        tolerance += BLURRED / float(arc_lengths(line)[-1])
         accepted = [end is not None for end in ends]
         places = np.array([line[k] if end is None else end[0] for k, end in zip((0, -1), ends, strict=True)])
         strange = [0.0 if end is None else end[1] for end in ends]
@@ -358,6 +363,8 @@ class Tracker:
         fit, excess = line, 0.0
         while True:
             weights = np.where(accepted, 1.0 / (END * half) ** 2, 0.0)
+            if not any(accepted):
+                known = replace(known, along=np.full(count, 1.0 / (FREE[1] * half) ** 2))
             fit = fitted(line, replace(known, ends=places, end_weights=weights))
             if not all(accepted):
                 return fit, (accepted[0], accepted[1]), 0.0
@@ -404,7 +411,7 @@ class Tracker:
                                 cv2.COLOR_RGB2Lab)
         # A mixture of colours, as of skin, has some pixels of the DLO's colour; the DLO has no others.
         side = max(2, round(0.6 * self._width() / factor))
-        return np.asarray(cv2.blur(odds(self._table, lab), (side, side)) > ALIKE), factor
+        return np.asarray(cv2.blur(odds(self._table, lab), (side, side)) > self._alike), factor
 
     def _unexplained(self, pixels: Pixels, line: Floats) -> float:
         """Return the area with the DLO's colour that is not at the line, as a share of the DLO's."""

@@ -90,8 +90,8 @@ def test_the_flag_of_a_telephone_turns_the_images_upright(mp4, folder):
 
 def test_times_come_from_the_file_where_the_frame_rate_varies(mp4, folder):
     octets = bytearray(mp4.read_bytes())
-    # ISO/IEC 14496-12: the table of durations (stts) gets a second entry, so that the boxes around it grow; the
-    # list of edits, which would end the film as early as before, becomes free space.
+    # ISO/IEC 14496-12: the table of durations (stts) gets a second entry, so that the boxes around it grow;
+    # the list of edits, which would end the film as early as before, becomes free space.
     octets = octets.replace(b'elst', b'free')
     place = octets.index(b'stts')
     count, duration = struct.unpack('>2i', octets[place + 12:place + 20])
