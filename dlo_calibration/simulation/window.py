@@ -53,7 +53,8 @@ class ShownMotion:
     hands: tuple[tuple[Colour, Floats, tuple[bool, ...]], ...]
 
     @classmethod
-    def of(cls, name: str, trial: Trial, motion: Motion, colours: Mapping[str, str], radius: float) -> ShownMotion:
+    def of(cls, name: str, trial: Trial, motion: Motion, colours: Mapping[str, str],
+           radius: float) -> ShownMotion:
         """
         Return the film of a simulated motion.
 
