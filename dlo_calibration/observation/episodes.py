@@ -400,6 +400,11 @@ def _path(seen: Sightings, hold: _Hold, initial: Chain) -> Hand:
     if len(known) < 2:
         raise InputError('hand', f'{hold.hand.name}, which is hardly seen while it holds the DLO',
                          'a tag that the camera sees', 'glue it where the hand does not hide it')
+    if seen.cameras is not None and np.nanmax(places[known, 2]) - seen.radius < LIFTED:
+        # It drags the DLO over the table: where that meets the line of sight, the grip is known best.
+        cameras = seen.cameras[known]
+        share = (seen.radius - cameras[:, 2:]) / (places[known, 2:] - cameras[:, 2:])
+        places[known] = cameras + share * (places[known] - cameras)
     kept = [known[0]]
     for k in known[1:]:
         if seen.times[k] - seen.times[kept[-1]] >= PATH or k == known[-1]:
