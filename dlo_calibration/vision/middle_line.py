@@ -343,12 +343,13 @@ def straighten(pixels: NDArray[np.uint8], line: Floats, half: Floats, offsets: F
     return Strip(line, normals, half, offsets, lab)
 
 
-def learn_colours(strip: Strip, inner: float, outer: tuple[float, float]) -> Singles:
+def learn_colours(strip: Strip, inner: float, outer: tuple[float, float], others: float = 0.0) -> Singles:
     """
     Return a table of the logarithm of the odds that a colour is the DLO's.
 
     :param inner: offsets below this count as the DLO.
     :param outer: offsets between these count as the ground, which may be in shadow, too.
+    :param others: share of each colour in what may come into the picture later.
     """
     far = np.abs(strip.offsets)
     of_dlo = _share(strip.lab[:, far <= inner].reshape(-1, 3))
@@ -356,7 +357,7 @@ def learn_colours(strip: Strip, inner: float, outer: tuple[float, float]) -> Sin
     shadows = sum((_share(outside * np.float32(k)) for k in DARKER), np.zeros(BINS))
     of_ground = 0.6 * _share(outside) + 0.4 / len(DARKER) * shadows
     least = UNKNOWN * of_dlo.mean() + 1e-7
-    logarithms: Singles = np.log((of_dlo + least) / (of_ground + least)).astype(np.float32).ravel()
+    logarithms: Singles = np.log((of_dlo + least) / (of_ground + others + least)).astype(np.float32).ravel()
     return np.asarray(np.clip(logarithms - np.float32(STRANGE), -MOST, MOST))
 
 
