@@ -33,7 +33,7 @@ PLACES = 101  # along the DLO at which a hand may hold it
 HELD = 0.012  # m; from a hand to the point that it holds, at most, over most of the movement
 BESIDE = 0.005  # of a grip's distance from its tag that counts as error: of places alike, the nearest is held
 TRUSTED = 0.9  # of the pictures of a movement; in the others, the tracker may be wrong
-AT_REST = 0.003  # m; nearer to where a hand closes, it stands there
+AT_REST = 0.0015  # m; nearer to where a hand closes, it stands there
 REACH = 0.25  # m from a tag to what the hand holds, at most
 LIFTED = 0.008  # m above the table
 #: A beam that is lifted by its diameter leaves the table at 6 to 12 diameters to either side, and with the
