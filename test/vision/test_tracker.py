@@ -127,7 +127,8 @@ def test_a_crossing_keeps_the_order():
         assert not one.lost
         on_table = curve[np.linspace(0, 400, COUNT).round().astype(int), 2] < RADIUS + 0.001
         off = errors(one, curve)[on_table]
-        assert np.nanmean(off) < 2 * FAR
+        # The loop slides, and the points with it; on the wrong strand they would be 0.1 m and more away.
+        assert np.nanmax(off) < 0.03
         assert np.isfinite(off).mean() > 0.7
 
 
