@@ -59,6 +59,7 @@ class Source:
     :param numbers: of the trials, from 1; trials that the user leaves out count, too.
     :param implausible: why the trials cannot be as described, see `plausibility`.
     :param evidence: of the hands in the trials.
+    :param parts: several sessions of one DLO, of which this is made; empty: it is one.
     """
 
     selection: Selection
@@ -73,6 +74,7 @@ class Source:
     numbers: tuple[int, ...] = ()
     implausible: tuple[str, ...] = ()
     evidence: GripEvidence = GripEvidence(None, None, ())
+    parts: tuple[Source, ...] = ()
 
     @property
     def trial_warnings(self) -> tuple[str, ...]:
@@ -185,7 +187,8 @@ def read_sources(selections: Sequence[Selection], warn: Callable[[str], None]) -
     options = {**first.options.flat(), 'sessions': ' '.join(str(len(source.trials)) for source in sources)}
     path = first.path.with_name('+'.join(source.path.name for source in sources))
     session = Session(path, records, records, FileOptions(options))
-    merged = Source(replace(selections[0], path=path), session, None, Options.of(options), (), None)
+    merged = Source(replace(selections[0], path=path), session, None, Options.of(options), (), None,
+                    parts=tuple(sources))
     return _with_trials(merged, warn)
 
 
