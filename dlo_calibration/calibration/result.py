@@ -21,7 +21,7 @@ from dlo_calibration.evaluation.residuals import at_every_goal, ResidualLayout
 from dlo_calibration.inference.advice import Advice
 from dlo_calibration.inference.examination import Confirmation, DISTANCE_TOLERANCE, Examination
 from dlo_calibration.inference.missing_parameters import MissingParameter, PARTS
-from dlo_calibration.inference.outlier import Outlier
+from dlo_calibration.inference.outlier import Outlier, SOMETHING_ELSE
 from dlo_calibration.inference.together import known_together, Together
 from dlo_calibration.inference.uncertainty import (
     DEVIATIONS,
@@ -217,11 +217,10 @@ class CalibrationResult:
             return ''
         without = ', '.join(f'{name} {number(odd.values[name])} instead of {number(self.values[name])}'
                             for name in odd.decided) or 'the same values within their intervals'
-        why = 'its goal chains seem to run from the other end of the DLO' if odd.turned else \
-            'a hand may have slipped or let go early'
+        why = 'its goal chains seem to run from the other end of the DLO' if odd.turned else SOMETHING_ELSE
         if odd.sensitive:
-            why += (f'; or it is only sensitive, as the uncertainty of the parameters moves its points by '
-                    f'{measured(odd.spread, "m")}')
+            why = (f'it is sensitive, as the uncertainty of the parameters moves its points by '
+                   f'{measured(odd.spread, "m")}; or {SOMETHING_ELSE}')
         return (f'{odd.trial} does not fit the others: {measured(odd.error, "m")} from what they predict, '
                 f'where they miss {measured(odd.usual, "m")}; without it: {without}; {why}: repeat it, or '
                 f'leave it out (--without {odd.number})')

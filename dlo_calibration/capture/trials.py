@@ -223,16 +223,8 @@ class Drafts:
 
     @property
     def options(self) -> dict[str, Any]:
-        """
-        The options of these trials, by name.
-
-        The table is the plane of the scale; the search for the radius begins at the measured one.
-        """
-        options: dict[str, Any] = {'table': True, 'table_height': 0.0, 'mass': self.mass}
-        if self.diameter is not None:
-            value = BY_NAME['self_collision'].value(self.diameter / 2)
-            options['self_collision'] = min(max(value, 0.0), SCALE)
-        return Options.of(options).flat()
+        """The options of these trials, by name."""
+        return measured_options(self.diameter, self.mass)
 
     def plain(self) -> dict[str, Any]:
         """Return the drafts as plain values, for the page."""
@@ -285,6 +277,22 @@ class Drafter:
             goal, held_in_goal = entry.goal, held_after(entry.steps, held)
         return Drafts(photographs, tuple(draft for _, draft in self._drafts.values()), document.dlo.mass,
                       place_obstacles(document, photographs))
+
+
+def measured_options(diameter: float | None, mass: float = 0.0) -> dict[str, Any]:
+    """
+    Return the options of trials that a camera observed, by name.
+
+    The table is the plane of the scale; the search for the radius begins at the measured one.
+
+    :param diameter: of the DLO [m]; None: unknown.
+    :param mass: of the DLO [kg]; 0: unknown.
+    """
+    options: dict[str, Any] = {'table': True, 'table_height': 0.0, 'mass': mass}
+    if diameter is not None:
+        value = BY_NAME['self_collision'].value(diameter / 2)
+        options['self_collision'] = min(max(value, 0.0), SCALE)
+    return Options.of(options).flat()
 
 
 def write_session(path: Path, trials: Sequence[Trial], options: Mapping[str, Any]) -> None:

@@ -25,6 +25,8 @@ from dlo_calibration.model.chain import Floats
 LARGER = 1.5  # times the usual error: a trial is tried without if its error is at least so large
 SURELY = 1.7  # times the usual error of the others
 SPREAD, USUAL_SPREAD = 3.5, 0.12  # standard deviations of the logarithm of the others' errors; at least
+#: What may be wrong with a trial that does not fit the others.
+SOMETHING_ELSE = 'a hand may have slipped or let go early, or the DLO does there what the model does not know'
 
 
 @dataclass(frozen=True)

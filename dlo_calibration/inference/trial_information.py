@@ -31,7 +31,7 @@ from dlo_calibration.evaluation.pool import Pool
 from dlo_calibration.evaluation.residuals import Huber, ResidualLayout
 from dlo_calibration.inference.advice import sensitivities
 from dlo_calibration.inference.examination import Examination, extended
-from dlo_calibration.inference.outlier import candidate, is_outlier
+from dlo_calibration.inference.outlier import candidate, is_outlier, SOMETHING_ELSE
 from dlo_calibration.inference.uncertainty import (
     at_minimum,
     IDENTIFIABLE,
@@ -215,8 +215,7 @@ class Appraisal:
             return ''
         usual = float(np.delete(errors, k).mean())
         return (f'{trials[k].name} does not fit the others: {measured(float(errors[k]), "m")} from what they '
-                f'predict, where they miss {measured(usual, "m")}; a hand may have slipped or let go early: '
-                'repeat it')
+                f'predict, where they miss {measured(usual, "m")}; {SOMETHING_ELSE}: repeat it')
 
     @classmethod
     def before(cls, names: tuple[str, ...], point: Floats) -> Appraisal:

@@ -194,7 +194,8 @@ def test_a_chaotic_trial_of_a_known_rope_is_named_and_the_result_is_usable():
 
 @pytest.mark.parametrize('wrong', [
     pytest.param(lambda: coiled(5, damping=65.0), id='drag', marks=pytest.mark.long),
-    pytest.param(lambda: carried(5, 0, (-0.25, 0.2), 2.0, flexibility=85.0), id='another rope')])
+    pytest.param(lambda: carried(5, 0, (-0.25, 0.2), 2.0, flexibility=85.0), id='another rope',
+                 marks=pytest.mark.long)])
 def test_a_trial_that_went_wrong_is_not_sensitive_though_the_hand_holds_the_rope(wrong):
     result = known_rope(wrong())
     assert GripEvidence.of(result.trials).losses == ()
@@ -204,8 +205,7 @@ def test_a_trial_that_went_wrong_is_not_sensitive_though_the_hand_holds_the_rope
 
 
 @pytest.mark.long
-@pytest.mark.xfail(reason='with friction in the material frame, the others predict trial 8 63 mm off')
-def test_a_recording_of_a_cable_that_is_only_sensitive_makes_no_result_unusable(tmp_path):
+def test_a_recording_that_the_others_do_not_predict_is_named_and_they_fit_better_without_it(tmp_path):
     if not DATA.is_dir():
         pytest.skip(f'{DATA} is not there; DLO_DATA names the folder of measured data')
     place = spec_from_file_location('convert', ROOT / 'benchmark' / 'convert.py')
@@ -214,7 +214,10 @@ def test_a_recording_of_a_cable_that_is_only_sensitive_makes_no_result_unusable(
     assert convert.main(['--data', str(DATA), 'mocap', 'dlo3', str(tmp_path / 'out'), '--recordings',
                          '0,8,16,24,32,40,48,54']) == 0
     session = read_session(tmp_path / 'out')
-    result = calibrate(session.trials, replace(session.options, engine='compiled', workers=2))
-    assert not result.unusable
-    assert result.outlier is None or result.outlier.trial == 'trial 8' and result.outlier.sensitive
-    assert any('does not fit the others' in text for text in result.warnings) == (result.outlier is not None)
+    options = replace(session.options, engine='compiled', workers=2)
+    result = calibrate(session.trials, options)
+    assert result.outlier.trial == 'trial 8'
+    assert 'what the model does not know' in result.unusable
+    without = calibrate(session.trials[:7], options)
+    assert not without.unusable
+    assert without.errors.mean < 0.7 * result.errors.mean
