@@ -4,7 +4,8 @@
 """
 Track DLOs in rendered films whose truth is known, and compare.
 
-A film shows a simulated rope and a hand that moves it, at 1920 x 1080 pixels and 30 images a second, with shadows, blur, noise and compression; in two of ten, the camera is held in the hand.
+A film shows a simulated rope and a hand that moves it, at 1920 x 1080 pixels and 30 images a second, with
+shadows, blur, noise and compression; in two of ten, the camera is held in the hand.
 
     python benchmark/film.py [FILMS] [SECONDS]
 

@@ -13,7 +13,7 @@ import numpy as np
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.observation.episodes import Episode, episodes, HandSightings, Sightings
-from dlo_calibration.vision.observer import View
+from dlo_calibration.vision.observer import ImageView
 from dlo_calibration.vision.tags import tag_path, TagPose
 
 FEWEST_SEEN = 5  # pictures in which a tag is seen; fewer may be misreadings
@@ -42,15 +42,15 @@ class Filming:
 
     held: Sequence[HeldPoint] = ()
     times: list[float] = field(default_factory=list)
-    _views: list[View] = field(default_factory=list)
+    _views: list[ImageView] = field(default_factory=list)
     _points: list[Floats] = field(default_factory=list)  # measured in space
     _diameters: list[float] = field(default_factory=list)
 
-    def add(self, view: View, depth: Floats | None = None) -> Floats:
+    def add(self, view: ImageView, depth: Floats | None = None) -> Floats:
         """
         Take the view of the next image.
 
-        :param depth: of each pixel, as for `View.points`.
+        :param depth: of each pixel, as for `ImageView.points`.
         :returns: the points (count, 3) of the DLO [m]; NaN where it is not seen.
         """
         # The diameter does not change, and its median needs no more.

@@ -193,12 +193,14 @@ class Drafts:
     :param trials: in the order of the document.
     :param mass: of the DLO [kg]; 0: unknown.
     :param placed: the obstacles, or why they cannot be placed, in the order of the document.
+    :param filmed_diameter: diameter of the DLO as a film shows it [m]; None: none does.
     """
 
     photographs: Mapping[str, Measurement]
     trials: tuple[TrialDraft, ...]
     mass: float = 0.0
     placed: tuple[PlacedObstacle, ...] = ()
+    filmed_diameter: float | None = None
 
     @cached_property
     def complete(self) -> tuple[Trial, ...]:
@@ -219,7 +221,8 @@ class Drafts:
     @property
     def diameter(self) -> float | None:
         """Diameter of the DLO [m]; None: neither given nor measured yet."""
-        return next((photograph.thickness for photograph in self.photographs.values()), None)
+        measured = next((photograph.thickness for photograph in self.photographs.values()), None)
+        return self.filmed_diameter if measured is None else measured
 
     @property
     def options(self) -> dict[str, Any]:

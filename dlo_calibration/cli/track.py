@@ -30,7 +30,7 @@ from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.episodes import Episode
 from dlo_calibration.vision.film import Film, read_film
 from dlo_calibration.vision.lens import read_lens
-from dlo_calibration.vision.observer import drawn, FilmWriter, Observer, View
+from dlo_calibration.vision.observer import drawn, FilmWriter, ImageView, Observer
 from dlo_calibration.vision.pose import scale_from_points
 from dlo_calibration.vision.scale import Scale
 from dlo_calibration.vision.view import BoardFinder, film_lens
@@ -134,7 +134,7 @@ def _scale(chosen: argparse.Namespace, film: Source) -> Scale | BoardFinder | No
 
 
 def _tracked(film: Source, clicks: Any, chosen: argparse.Namespace, scale: Scale | BoardFinder | None,
-             problems: list[str]) -> list[View]:
+             problems: list[str]) -> list[ImageView]:
     """
     Return the views of all images, in the order of time; what goes wrong on the way ends it.
 
@@ -149,7 +149,7 @@ def _tracked(film: Source, clicks: Any, chosen: argparse.Namespace, scale: Scale
     views = [forwards.start(first.time, first.pixels, clicks)]
     expected = max(round(film.duration * film.frame_rate), 1)
     progress = _Progress(expected)
-    earlier: list[View] = []
+    earlier: list[ImageView] = []
     try:
         for frame in frames:
             views.append(forwards.next(frame.time, frame.pixels))
@@ -185,7 +185,8 @@ class _Progress:
                       f'{max(self._expected - done, 0) / rate:.0f} s left')
 
 
-def _held(marks: Sequence[tuple[float, float, float]], views: Sequence[View], at: float) -> list[HeldPoint]:
+def _held(marks: Sequence[tuple[float, float, float]], views: Sequence[ImageView],
+          at: float) -> list[HeldPoint]:
     """Return the places along the DLO that are nearest to pixels of the image at an instant."""
     held = []
     clicked = min(views, key=lambda view: (view.time < at, abs(view.time - at)))
@@ -219,7 +220,7 @@ def _trials(cut: Sequence[Episode], problems: list[str]) -> tuple[list[Episode],
     return used, trials
 
 
-def _about(views: Sequence[View], film: Source) -> list[str]:
+def _about(views: Sequence[ImageView], film: Source) -> list[str]:
     """Return sentences about where the DLO was lost, and where it is not whole in the picture."""
     problems = []
     spans = _lost(views)
@@ -241,17 +242,17 @@ def _about(views: Sequence[View], film: Source) -> list[str]:
     return problems
 
 
-def _lost(views: Sequence[View]) -> list[tuple[float, float]]:
+def _lost(views: Sequence[ImageView]) -> list[tuple[float, float]]:
     """Return from when to when the DLO was lost."""
     flags = np.concatenate([[False], [view.tracked.lost for view in views], [False]]).astype(int)
     edges = np.flatnonzero(np.diff(flags)).reshape(-1, 2)
     return [(views[a].time, views[min(b, len(views) - 1)].time) for a, b in edges]
 
 
-def _draw(film: Source, views: Sequence[View], path: Path) -> None:
+def _draw(film: Source, views: Sequence[ImageView], path: Path) -> None:
     """Write the film with the line."""
     writer = None
-    waiting: Iterator[View | None] = chain(views, [None])
+    waiting: Iterator[ImageView | None] = chain(views, [None])
     view = next(waiting)
     try:
         for frame in film.frames(views[0].time):
@@ -270,13 +271,13 @@ def _draw(film: Source, views: Sequence[View], path: Path) -> None:
             writer.close()
 
 
-def _rate(views: Sequence[View]) -> float:
+def _rate(views: Sequence[ImageView]) -> float:
     """Return the images in a second, for a film with an even rate."""
     lapses = [after.time - before.time for before, after in pairwise(views)]
     return float(np.clip(1.0 / np.median(lapses), 1.0, 240.0)) if lapses else 30.0
 
 
-def _report(views: Sequence[View], filming: Filming, cut: Sequence[Episode], trials: Sequence[Trial],
+def _report(views: Sequence[ImageView], filming: Filming, cut: Sequence[Episode], trials: Sequence[Trial],
             problems: Sequence[str], spent: float, elapsed: float) -> dict[str, Any]:
     return {
         'frames': len(views), 'tracked': sum(not view.tracked.lost for view in views),
@@ -289,7 +290,7 @@ def _report(views: Sequence[View], filming: Filming, cut: Sequence[Episode], tri
         'lost': [list(span) for span in _lost(views)], 'problems': list(problems)}
 
 
-def _length(filming: Filming, views: Sequence[View]) -> float | None:
+def _length(filming: Filming, views: Sequence[ImageView]) -> float | None:
     """Return the median length of the DLO where all of it was seen [m]; None: never, or without a scale."""
     lengths = []
     for view in views:

@@ -41,7 +41,8 @@ LIFTED = 0.008  # m above the table
 BUMP, SLACK = 12.0, 1.5
 TAG_ABOVE = 0.06  # m, from what a hand holds up to its tag, at most, where its grip is not yet known
 THIN, SHIFT = 0.1, 0.003  # s, m; goals of a DLO that moves lie at least so far apart
-START, END = 1.5, 2.5  # s of rest before and after a movement that are used at most
+START, END = 4.0, 2.5  # s of rest before and after a movement that are used at most
+LEAVES = 1.0  # s after it, in which a hand still hides a part of the DLO; left out if the rest is longer
 FEWEST = 12  # chains of a rest, as for a stream of goals; fewer are given as their mean
 PATH = 0.03  # s between waypoints of a hand, at least
 
@@ -157,7 +158,7 @@ def _episode(seen: Sightings, hands: Sequence[HandSightings], motion: Floats,
     if not len(rest):
         raise InputError('movement', 'a DLO that moves from the beginning', f'a rest of {REST:g} s before it',
                          'begin to film earlier, or wait between two movements')
-    start = _mean(seen.points[rest])
+    start = _resting(seen.points[rest])
     initial = Chain(start)
     holds = [hold for hand in hands if (hold := _hold(seen, hand, initial, motion, first, last)) is not None]
     if not holds:
@@ -167,8 +168,9 @@ def _episode(seen: Sightings, hands: Sequence[HandSightings], motion: Floats,
     closes, opens = min(hold.first for hold in holds), max(hold.last for hold in holds)
     initial = Chain(_fewer(start, count))
     paths = [_path(seen, hold, initial) for hold in holds]
-    settled = _between(times, max(times[opens], times[last]) + SPAN,
-                       min(times[max(last, opens)] + SPAN + END, times[after]))
+    begin = times[max(last, opens)] + SPAN
+    begin += LEAVES if times[after] - begin > LEAVES + END else 0.0
+    settled = _between(times, begin, min(begin + END, times[after]))
     settled = settled[(settled <= after) & (settled > opens)]
     if not len(settled):
         raise InputError('movement', 'a film that ends, or a next movement that begins, before the DLO rests',
@@ -177,7 +179,7 @@ def _episode(seen: Sightings, hands: Sequence[HandSightings], motion: Floats,
     goals = [(float(times[k]), points) for k in moving if (points := _low(seen, holds, k)) is not None]
     chains = [(float(times[k]), seen.points[k]) for k in settled if _usable(seen.points[k])]
     if len(chains) < FEWEST:
-        mean = _mean(seen.points[settled])
+        mean = _resting(seen.points[settled])
         chains = [(float(times[settled[-1]]), mean)] if _usable(mean) else []
     if not chains:
         raise InputError('movement', 'a DLO of which less than half is seen afterwards', 'the whole DLO',
@@ -198,13 +200,15 @@ def _between(times: Floats, begin: float, end: float) -> NDArray[np.intp]:
     return np.flatnonzero((times >= begin - 1e-9) & (times <= end + 1e-9))
 
 
-def _mean(points: Floats) -> Floats:
-    """Return the mean (m, 3) of chains (k, m, 3) at rest; NaN where fewer than half show a point."""
-    shown = np.isfinite(points[..., 0]).sum(axis=0)
-    mean = np.full(points.shape[1:], np.nan)
-    enough = shown >= max(1, len(points) // 2)
-    mean[enough] = np.nanmean(points[:, enough], axis=0)
-    return mean
+def _resting(points: Floats) -> Floats:
+    """
+    Return the median (m, 3) of chains (k, m, 3) at rest; NaN where fewer than a third show a point.
+
+    A hand that comes or goes hides a part for less than half of the time.
+    """
+    median = _median(points)
+    median[np.isfinite(points[..., 0]).sum(axis=0) < max(1, len(points) // 3)] = np.nan
+    return median
 
 
 def _usable(points: Floats) -> bool:

@@ -28,7 +28,7 @@ from dlo_calibration.observation.episodes import Episode, without_lifted
 from dlo_calibration.ros.diagnostics import LOST, STOPPED, tracker_status, TRACKING, WAITING
 from dlo_calibration.ros.node_session import FAILED, NodeInterface, NodeSession, NodeState, refusal_text
 from dlo_calibration.vision.lens import Lens, lens_of
-from dlo_calibration.vision.observer import depths, drawn, jpeg_of, Observer, View
+from dlo_calibration.vision.observer import depths, drawn, ImageView, jpeg_of, Observer
 from dlo_calibration.vision.photograph import Pixels
 from dlo_calibration.vision.pose import scale_from_points
 from dlo_calibration.vision.scale import Scale
@@ -115,7 +115,7 @@ class Sight:
     """
 
     stamp: int
-    view: View
+    view: ImageView
     points: Floats
     overlay: bytes | None
     episodes: tuple[Episode, ...]

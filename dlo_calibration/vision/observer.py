@@ -30,7 +30,7 @@ TAG_COLOUR = (60, 255, 60)
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class ImageView:
     """
     What an image shows.
 
@@ -104,7 +104,7 @@ class Observer:
         self._last: Scale | None = None
         self._time = 0.0
 
-    def start(self, time: float, pixels: Pixels, clicks: ArrayLike) -> View:
+    def start(self, time: float, pixels: Pixels, clicks: ArrayLike) -> ImageView:
         """
         Find the DLO in the first image.
 
@@ -122,7 +122,7 @@ class Observer:
         self._time = time
         return self._view(time, pixels, scale, self._tracker.start(pixels, clicks, scale))
 
-    def next(self, time: float, pixels: Pixels) -> View:
+    def next(self, time: float, pixels: Pixels) -> ImageView:
         """Find the DLO in the next image."""
         scale = self._scale(pixels)
         elapsed, self._time = abs(time - self._time), time
@@ -135,13 +135,13 @@ class Observer:
             return self._last
         return self._given
 
-    def _view(self, time: float, pixels: Pixels, scale: Scale | None, tracked: Tracked) -> View:
+    def _view(self, time: float, pixels: Pixels, scale: Scale | None, tracked: Tracked) -> ImageView:
         if scale is None:
-            return View(time, tracked)
+            return ImageView(time, tracked)
         tags = self._finder.find(pixels)
         poses = {number: pose for number, corners in tags.items()
                  if (pose := tag_poses(corners, scale)) is not None}
-        return View(time, tracked, scale, tags, poses)
+        return ImageView(time, tracked, scale, tags, poses)
 
 
 def check_light(pixels: Pixels) -> None:
@@ -155,7 +155,7 @@ def check_light(pixels: Pixels) -> None:
                          'switch the light on, or begin at a later instant (--at)')
 
 
-def drawn(pixels: Pixels, view: View | None, widest: int = WIDEST) -> Pixels:
+def drawn(pixels: Pixels, view: ImageView | None, widest: int = WIDEST) -> Pixels:
     """
     Return an image with the line of the DLO and the tags.
 

@@ -85,6 +85,9 @@ def _found(grey: Pixels) -> dict[int, Floats]:
         return {}
     new = hasattr(_ARUCO, 'ArucoDetector')
     options = _ARUCO.DetectorParameters() if new else _ARUCO.DetectorParameters_create()
+    # Cells of three or four pixels, whose edges are grey, are read in their middles.
+    options.perspectiveRemovePixelPerCell = 8
+    options.perspectiveRemoveIgnoredMarginPerCell = 0.25
     if new:
         corners, numbers, _ = _ARUCO.ArucoDetector(_tag_dictionary(), options).detectMarkers(grey)
     else:

@@ -143,7 +143,7 @@ class Tracker:
         self._length = float(arc[-1])
         self._half = half / float(np.median(self._finenesses(line)))  # in units of the length
         strip = straighten(pixels, line, np.full(count, half), np.arange(-2.4, 2.41, 0.08))
-        self._table = learn_colours(strip, 0.7, (1.4, 2.4))
+        self._table = learn_colours(strip, 0.5, (1.4, 2.4))
         self._line = _Line(line, np.interp(np.linspace(0, 1, count), np.linspace(0, 1, len(trace.sure)),
                                            trace.sure) > 0.5, (True, True), 0.0)
         self._velocity: Floats = np.zeros_like(line)
@@ -262,11 +262,12 @@ class Tracker:
         arc = arc_lengths(line)
         # Another strand is much farther along the line than through the air.
         apart: Bools = np.abs(arc[:, None] - arc) > 2.0 * distance + 4.0 * half[:, None]
-        for row in np.flatnonzero((apart & (distance < reach[:, None])).any(axis=1)):
-            others = line[apart[row] & (distance[row] < reach[row])]
+        near = np.asarray(apart & (distance < reach[:, None]))
+        for row in np.flatnonzero(near.any(axis=1)):
+            others = line[near[row]]
             at = strip.line[row] + (strip.offsets * strip.half[row])[:, None] * strip.normals[row]
-            near = np.linalg.norm(at[:, None] - others, axis=2).min(axis=1) < 1.1 * half[row]
-            logarithms[row, near] = 0.0
+            explained = np.linalg.norm(at[:, None] - others, axis=2).min(axis=1) < 1.1 * half[row]
+            logarithms[row, explained] = 0.0
 
     def _end(self, pixels: Pixels, line: Floats, half: Floats, measured: Floats,
              quality: Floats) -> Floats | None:
@@ -366,9 +367,14 @@ class Tracker:
         covered = np.zeros(mask.shape, np.uint8)
         points = np.rint((line - low) / factor * 16).astype(np.int32)
         cv2.polylines(covered, [points], False, 1, round(2.2 * thick / factor + 2), cv2.LINE_8, 4)
-        elsewhere = (mask & (covered == 0)).astype(np.uint8)
-        elsewhere = np.asarray(cv2.morphologyEx(elsewhere, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8)))
-        return float(elsewhere.sum()) * factor ** 2 / max(thick * float(arc_lengths(line)[-1]), 1.0)
+        elsewhere: Any = (mask & (covered == 0)).astype(np.uint8)
+        # What is thicker than the DLO, or not much longer than thick, is another thing, such as a hand.
+        kernel = np.ones((round(1.7 * thick / factor) + 1,) * 2, np.uint8)
+        elsewhere &= 1 - cv2.morphologyEx(elsewhere, cv2.MORPH_OPEN, kernel)
+        elsewhere = cv2.morphologyEx(elsewhere, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+        _, _, parts, _ = cv2.connectedComponentsWithStats(elsewhere)
+        areas = parts[1:, cv2.CC_STAT_AREA] * float(factor ** 2)
+        return float(areas[areas > 2.0 * thick ** 2].sum()) / max(thick * float(arc_lengths(line)[-1]), 1.0)
 
     def _searched(self, pixels: Pixels) -> _Line | None:
         """Return the line found anywhere in the picture; None: there is none that is sure."""

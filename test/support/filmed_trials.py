@@ -24,8 +24,8 @@ NODES = 61
 RATE = 30.0  # images in a second
 WAIT, COME, REST = 1.2, 0.6, 2.6  # s before a hand comes, until it closes, and after it opens
 GRIP_TO_TAG = np.array([0.0, -0.012, 0.03])  # m, in the frame of the hand
-BOARD = LaidBoard((-0.29, -0.12))
-CELL = 12  # px of a cell in the picture of a tag
+BOARD = LaidBoard((0.22, -0.33))  # in the middle, where it determines the scale best
+CELL = 20  # px of a cell in the picture of a tag
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Move:
     seconds: float = 1.6
 
 
-MOVES = (Move(12, (0.06, 0.18)), Move(55, (-0.12, -0.05), turn=-30.0))
+MOVES = (Move(12, (0.06, 0.18)), Move(55, (-0.12, 0.06), turn=-30.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ class FilmedTrials:
 
     def tag(self, k):
         """Return the middle (3,) [m] and the rotation (3, 3) of the tag in image k."""
-        rotation = Rotation.from_euler('zx', [self.turns[k], 25.0], degrees=True).as_matrix()
+        rotation = Rotation.from_euler('zx', [self.turns[k], -25.0], degrees=True).as_matrix()
         above = Rotation.from_euler('z', self.turns[k], degrees=True).apply(GRIP_TO_TAG)
         return self.grips[k] + above, rotation
 
@@ -99,7 +99,7 @@ def tag_picture(number):
 
 def film_camera(size=(1920, 1080)):
     """Return a camera that stands in front of the table."""
-    return Camera(size, 1500.0 * size[0] / 1920, tilt=0.45, distance=0.95, target=(0.15, 0.06))
+    return Camera(size, 1500.0 * size[0] / 1920, tilt=0.45, distance=0.85, target=(0.27, -0.03))
 
 
 def filmed_trials(moves=MOVES, rate=RATE, truth=None, seed=0):

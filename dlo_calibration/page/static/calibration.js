@@ -36,9 +36,9 @@ export class CalibrationStep {
   }
 
   missing() {
-    const {state, document: {trials}} = this.app.project;
+    const {trials} = this.app.project.state;
     if (!trials.length) return ['a trial'];
-    return trials.some((trial, k) => state.trials[k]?.complete) ? [] : ['a complete trial'];
+    return trials.some((trial) => trial.complete) ? [] : ['a complete trial'];
   }
 
   done() {
@@ -54,7 +54,10 @@ export class CalibrationStep {
     const trials = h(
       'section',
       {key: 'trials', 'aria-label': 'Trials'},
-      edited.trials.map((trial, k) => this.#trial(state.trials[k], k)),
+      state.trials.map((trial, k) => this.#trial(trial, k)),
+      edited.films.map((film) =>
+        button(`Watch ${film.name}`, () => app.openFilm(film.id), {key: film.id}),
+      ),
     );
     const start = h(
       'div.group',
