@@ -201,6 +201,9 @@ def report(number: int, folder: Path, longest: float) -> dict[str, Any]:
         tracked = tracker.next(frame.pixels, 1 / film.frame_rate, scale) if k else tracker.start(
             frame.pixels, clicks, scale)
         spent += time.process_time() - watch
+        if scale is None:
+            lost.append((frame.time, 'too little of the board is seen'))
+            continue
         if tracked.lost:
             lost.append((frame.time, tracked.reason))
             continue

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from concurrent.futures import CancelledError
+from copy import copy
 from dataclasses import dataclass
 import math
 from typing import Callable, Sequence
@@ -16,6 +17,7 @@ from dlo_calibration.calibration.options import Options
 from dlo_calibration.capture.document import FilmEntry, MarkEntry
 from dlo_calibration.capture.filming import Filming, HeldPoint
 from dlo_calibration.errors import InputError
+from dlo_calibration.files.image_topic import ImageTopic
 from dlo_calibration.messages.codec import NANOSECONDS
 from dlo_calibration.messages.collector import TrialCollector
 from dlo_calibration.messages.encoder import episode_messages
@@ -24,7 +26,7 @@ from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.episodes import Episode
 from dlo_calibration.vision.film import Film
 from dlo_calibration.vision.lens import Lens
-from dlo_calibration.vision.observer import Observer, View
+from dlo_calibration.vision.observer import ImageView, Observer
 from dlo_calibration.vision.scale import Scale
 from dlo_calibration.vision.view import BoardFinder, film_lens
 
@@ -35,15 +37,16 @@ FEWEST = 2  # clicks of a mark
 
 @dataclass(frozen=True, eq=False)
 class FilmedTrial:
-    """
-    A trial of a film.
-
-    :param trial: its times begin at `zero` of the film [s].
-    """
+    """A trial of a film, and the episode that it was made of."""
 
     episode: Episode
     trial: Trial
-    zero: float
+
+    @property
+    def zero(self) -> float:
+        """The time of the film at which the times of the trial begin [s]."""
+        hand = self.episode.hands[0]
+        return hand.start - next(own.start for own in self.trial.hands if own.name == hand.name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +61,7 @@ class Followed:
     """
 
     entry: FilmEntry
-    views: tuple[View, ...]
+    views: tuple[ImageView, ...]
     radius: float
     trials: tuple[FilmedTrial, ...]
     problems: tuple[str, ...]
@@ -78,69 +81,97 @@ def follow(film: Film, entry: FilmEntry, count: int, lens: Lens | None = None, *
            on_image: Callable[[int], None] = lambda done: None,
            should_stop: Callable[[], bool] = lambda: False) -> Followed:
     """
-    Follow a DLO through a film, from its first mark to both ends; each later mark corrects what follows.
+    Follow a DLO through a film, whose scale the printed board gives.
 
     :param count: of points of the chains.
     :param lens: of the camera; None: the views of the board give the focal length.
     :param on_image: called with the number of images that are done.
-    :raises InputError: where there are no marks, or nothing in the image of a mark.
+    :raises InputError: where there are no marks, or nothing in the image of the first one.
     :raises CancelledError: when stopped.
     """
-    marks = sorted((mark for mark in entry.marks if len(mark.clicks) >= FEWEST), key=lambda mark: mark.time)
-    if not marks:
-        raise InputError(f'film {entry.name}', 'no clicks', 'two or more clicks along the DLO in one image',
-                         'click on both ends of the DLO, and on its bends')
     lens = film_lens(film, entry.ruler) if lens is None else lens.resized(film.size)
-    views: list[View] = []
     problems: list[str] = []
-    done = 0
 
-    def seen(view: View) -> View:
-        nonlocal done
-        done += 1
+    def counted(done: int) -> None:
         on_image(done)
         if should_stop():
             raise CancelledError
-        return view
 
-    for mark, end in zip(marks, [*marks[1:], None], strict=True):
-        until = math.inf if end is None else end.time
-        observer = Observer(BoardFinder(lens, entry.ruler))
-        frames = film.frames(mark.time, until)
-        first = next(frames, None)
-        if first is None:
-            raise InputError(f'film {entry.name}', f'clicks at {mark.time:.2f} s, after its end',
-                             f'an instant of {film.duration:.1f} s', 'remove these clicks')
-        try:
-            views.append(seen(observer.start(first.time, first.pixels, _in_order(mark, views))))
-            views += [seen(observer.next(frame.time, frame.pixels)) for frame in frames]
-            if mark is marks[0] and first.time > 0.0:
-                observer = Observer(BoardFinder(lens, entry.ruler))
-                observer.start(first.time, first.pixels, mark.clicks)
-                before = [seen(observer.next(frame.time, frame.pixels))
-                          for frame in film.backwards(first.time)]
-                views[:0] = before[::-1]
-        except InputError as error:  # what was followed until then is kept
-            if not views:
-                raise
-            problems.append(f'from {mark.time:.2f} s on: {error}')
+    views = views_of(film, entry.marks, BoardFinder(lens, entry.ruler), problems, counted)
     filming = Filming(tuple(HeldPoint(held.place, held.height) for held in entry.held))
     for view in views:
         filming.add(view)
-    trials: list[FilmedTrial] = []
+    trials = filmed_trials(filming, count, problems)
+    return Followed(entry, tuple(views), filming.radius, trials, tuple(problems))
+
+
+def views_of(film: Film | ImageTopic, marks: Sequence[MarkEntry], scale: Scale | BoardFinder | None,
+             problems: list[str], on_image: Callable[[int], None] = lambda done: None) -> list[ImageView]:
+    """
+    Follow a DLO from its first mark to both ends of a film; each later mark corrects what follows.
+
+    What goes wrong later than in the first image ends it; why is added to `problems`.
+
+    :param on_image: called with the number of images that are done; its KeyboardInterrupt ends it, too.
+    :raises InputError: where there are no marks, or nothing in the image of the first one.
+    """
+    marks = sorted((mark for mark in marks if len(mark.clicks) >= FEWEST), key=lambda mark: mark.time)
+    if not marks:
+        raise InputError('film', 'no clicks', 'two or more clicks along the DLO in one image',
+                         'click on both ends of the DLO, and on its bends')
+    views: list[ImageView] = []
+    earlier: list[ImageView] = []
+
+    def keep(kept: list[ImageView], view: ImageView) -> None:
+        kept.append(view)
+        on_image(len(views) + len(earlier))
+
+    try:
+        for mark, after in zip(marks, [*marks[1:], None], strict=True):
+            observer = Observer(copy(scale))
+            frames = film.frames(mark.time, math.inf if after is None else after.time)
+            first = next(frames, None)
+            if first is None:
+                raise InputError('clicks', f'those of the image at {mark.time:g} s (--at)',
+                                 f'an instant of the film of {film.duration:.1f} s', 'choose an earlier one')
+            keep(views, observer.start(first.time, first.pixels, _in_order(mark, views)))
+            for frame in frames:
+                keep(views, observer.next(frame.time, frame.pixels))
+        if marks[0].time > 0.0:
+            observer, begin = Observer(copy(scale)), views[0].time
+            first = next(film.frames(begin))
+            observer.start(begin, first.pixels, marks[0].clicks)
+            for frame in film.backwards(begin):
+                keep(earlier, observer.next(frame.time, frame.pixels))
+    except InputError as error:
+        if not views:
+            raise
+        problems.append(str(error))
+    except KeyboardInterrupt:
+        problems.append('interrupted; what was tracked until then is kept')
+    return earlier[::-1] + views
+
+
+def filmed_trials(filming: Filming, count: int, problems: list[str]) -> tuple[FilmedTrial, ...]:
+    """
+    Return the trials of a film, as a reader of its session makes them; why there are none goes to `problems`.
+
+    :param count: of points of their chains.
+    """
+    trials = []
     try:
         cut, unused = filming.episodes(count)
         problems += unused
         for episode in cut:
             trial = _trial(episode, problems)
             if trial is not None:
-                trials.append(FilmedTrial(episode, trial, _zero(episode, trial)))
+                trials.append(FilmedTrial(episode, trial))
     except InputError as error:
         problems.append(str(error))
-    return Followed(entry, tuple(views), filming.radius, tuple(trials), tuple(problems))
+    return tuple(trials)
 
 
-def _in_order(mark: MarkEntry, views: Sequence[View]) -> Sequence[Sequence[float]]:
+def _in_order(mark: MarkEntry, views: Sequence[ImageView]) -> Sequence[Sequence[float]]:
     """Return the clicks of a mark, from the end at which the line so far begins."""
     last: Floats | None = next((view.tracked.pixels for view in reversed(views)
                                 if np.isfinite(view.tracked.pixels[[0, -1]]).all()), None)
@@ -165,10 +196,3 @@ def _trial(episode: Episode, problems: list[str]) -> Trial | None:
         return None
     problems += [f'{span}: {refusal}' for refusal in collector.refusals]
     return trials[0] if trials else None
-
-
-def _zero(episode: Episode, trial: Trial) -> float:
-    """Return the time of the film at which the times of a trial begin [s]."""
-    hand = episode.hands[0]
-    same = next(own for own in trial.hands if own.name == hand.name)
-    return hand.start - same.start

@@ -130,14 +130,14 @@ def _show(predictions: Named, options: Options, simulator: Simulator) -> None:
     :raises DloCalibrationError: if no window can be opened.
     """
     from dlo_calibration.report.drawing import hand_colours
-    from dlo_calibration.simulation.window import Film, FRAME_RATE, MOST_FRAMES, show
+    from dlo_calibration.simulation.window import FRAME_RATE, MOST_FRAMES, show, ShownMotion
 
     radius, films, levels = predictions[0][1].physical['self_collision'], [], []
     for name, prediction in predictions:
         trial, motion = motion_of_actions(
             prediction.start, [step.step for step in prediction.steps], simulator, prediction.physical,
             frame_rate=FRAME_RATE, most=MOST_FRAMES)
-        films.append(Film.of(name, trial, motion, hand_colours([trial]), radius))
+        films.append(ShownMotion.of(name, trial, motion, hand_colours([trial]), radius))
         levels.append(resting_level(trial, options.table_height))
     heights = [level - radius for level in levels if level is not None]
     show(films, radius, min(heights, default=options.table_height) if options.table else None, options.scene,

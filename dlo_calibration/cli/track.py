@@ -14,8 +14,9 @@ from typing import Any, cast, Iterator, Sequence
 import numpy as np
 
 from dlo_calibration.calibration.engines import SimulatorFactory
-from dlo_calibration.calibration.options import Options
+from dlo_calibration.capture.document import MarkEntry
 from dlo_calibration.capture.filming import Filming, HeldPoint
+from dlo_calibration.capture.following import filmed_trials, FilmedTrial, FRAME, views_of, ZERO
 from dlo_calibration.capture.trials import measured_options
 from dlo_calibration.cli.output import print_json, print_message, standard_output
 from dlo_calibration.cli.trace import check_count, pixels_of, places_of
@@ -23,21 +24,15 @@ from dlo_calibration.errors import InputError
 from dlo_calibration.files.image_topic import ImageTopic, read_image_topic
 from dlo_calibration.files.recording import write_records
 from dlo_calibration.files.session import message_records
-from dlo_calibration.messages.codec import NANOSECONDS
-from dlo_calibration.messages.collector import TrialCollector
 from dlo_calibration.messages.encoder import episode_messages
-from dlo_calibration.model.trial import Trial
-from dlo_calibration.observation.episodes import Episode
 from dlo_calibration.vision.film import Film, read_film
 from dlo_calibration.vision.lens import read_lens
-from dlo_calibration.vision.observer import drawn, FilmWriter, ImageView, Observer
+from dlo_calibration.vision.observer import drawn, FilmWriter, ImageView
 from dlo_calibration.vision.pose import scale_from_points
 from dlo_calibration.vision.scale import Scale
 from dlo_calibration.vision.view import BoardFinder, film_lens
 
 SESSION, TRACKED = 'session.mcap', 'tracked.mp4'
-FRAME = 'table'  # frame_id of the session
-ZERO = 1_700_000_000 * NANOSECONDS  # stamp of a film's first image: in 2023, as real stamps are
 PROGRESS = 2.0  # s between two lines about progress
 BORDER = 3.0  # px; a DLO whose end is nearer to the picture's border goes on beyond it
 LOST_LISTED = 5  # intervals in which the DLO is lost, of which the problems tell
@@ -79,32 +74,28 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     scale = _scale(chosen, film)
     problems: list[str] = []
     begin = time.perf_counter()
-    views = _tracked(film, clicks, chosen, scale, problems)
+    progress = _Progress(max(round(film.duration * film.frame_rate), 1))
+    clicked = MarkEntry(chosen.at, tuple(map(tuple, clicks.tolist())))
+    views = views_of(film, [clicked], scale, problems, progress.tell)
     spent = time.perf_counter() - begin
     filming = Filming(_held(marks, views, chosen.at))
     for view in views:
         filming.add(view)
-    cut: Sequence[Episode] = ()
-    try:
-        cut, unused = filming.episodes(chosen.count)
-        problems += unused
-    except InputError as error:
-        problems.append(str(error))
+    trials = filmed_trials(filming, chosen.count, problems)
     problems += _about(views, film)
-    cut, trials = _trials(cut, problems)
     if chosen.output is not None:
         chosen.output.mkdir(parents=True, exist_ok=True)
-        if cut:
-            diameter = round(2.0 * filming.radius, 4)
-            write_records(chosen.output / SESSION, message_records(episode_messages(cut, FRAME, ZERO)),
-                          measured_options(diameter))
+        if trials:
+            messages = episode_messages([own.episode for own in trials], FRAME, ZERO)
+            write_records(chosen.output / SESSION, message_records(messages),
+                          measured_options(round(2.0 * filming.radius, 4)))
         _draw(film, views, chosen.output / TRACKED)
     elapsed = time.perf_counter() - begin
-    report = _report(views, filming, cut, trials, problems, spent, elapsed)
+    report = _report(views, filming, trials, problems, spent, elapsed)
     if chosen.json:
         print_json(report)
     else:
-        _print(report, chosen.output, bool(cut))
+        _print(report, chosen.output, bool(trials))
     return 0
 
 
@@ -131,40 +122,6 @@ def _scale(chosen: argparse.Namespace, film: Source) -> Scale | BoardFinder | No
     if chosen.scale:
         return scale_from_points(*places_of(chosen.scale), film.size, lens)
     return None
-
-
-def _tracked(film: Source, clicks: Any, chosen: argparse.Namespace, scale: Scale | BoardFinder | None,
-             problems: list[str]) -> list[ImageView]:
-    """
-    Return the views of all images, in the order of time; what goes wrong on the way ends it.
-
-    :raises InputError: where there is nothing in the first image.
-    """
-    frames = film.frames(chosen.at)
-    first = next(frames, None)
-    if first is None:
-        raise InputError('--at', f'{chosen.at:g} s',
-                         f'an instant of the film of {film.duration:.1f} s', 'choose an earlier one')
-    forwards = Observer(scale)
-    views = [forwards.start(first.time, first.pixels, clicks)]
-    expected = max(round(film.duration * film.frame_rate), 1)
-    progress = _Progress(expected)
-    earlier: list[ImageView] = []
-    try:
-        for frame in frames:
-            views.append(forwards.next(frame.time, frame.pixels))
-            progress.tell(len(views))
-        if first.time > 0.0:
-            backwards = Observer(scale)
-            backwards.start(first.time, first.pixels, clicks)
-            for frame in film.backwards(first.time):
-                earlier.append(backwards.next(frame.time, frame.pixels))
-                progress.tell(len(views) + len(earlier))
-    except InputError as error:
-        problems.append(str(error))
-    except KeyboardInterrupt:
-        problems.append('interrupted; what was tracked until then is kept')
-    return earlier[::-1] + views
 
 
 class _Progress:
@@ -198,26 +155,6 @@ def _held(marks: Sequence[tuple[float, float, float]], views: Sequence[ImageView
                              'a pixel on the DLO', 'click on it in the image in which its points are')
         held.append(HeldPoint(nearest / (len(away) - 1), height))
     return held
-
-
-def _trials(cut: Sequence[Episode], problems: list[str]) -> tuple[list[Episode], list[Trial]]:
-    """Return the episodes that make trials, and the trials as a session's reader makes them."""
-    used, trials = [], []
-    for episode in cut:
-        span = f'{episode.start:.1f} to {episode.end:.1f} s'
-        collector = TrialCollector(Options())
-        try:
-            for message in episode_messages((episode,), FRAME, ZERO):
-                collector.add(message)
-            made = collector.trials
-        except InputError as error:
-            problems.append(f'{span}: {error}')
-            continue
-        problems += [f'{span}: {refusal}' for refusal in collector.refusals]
-        if made:
-            used.append(episode)
-            trials.append(made[0])
-    return used, trials
 
 
 def _about(views: Sequence[ImageView], film: Source) -> list[str]:
@@ -277,16 +214,16 @@ def _rate(views: Sequence[ImageView]) -> float:
     return float(np.clip(1.0 / np.median(lapses), 1.0, 240.0)) if lapses else 30.0
 
 
-def _report(views: Sequence[ImageView], filming: Filming, cut: Sequence[Episode], trials: Sequence[Trial],
+def _report(views: Sequence[ImageView], filming: Filming, trials: Sequence[FilmedTrial],
             problems: Sequence[str], spent: float, elapsed: float) -> dict[str, Any]:
     return {
         'frames': len(views), 'tracked': sum(not view.tracked.lost for view in views),
         'fps': len(views) / spent, 'seconds': elapsed, 'length_m': _length(filming, views),
         'diameter_m': 2.0 * filming.radius or None,
-        'trials': [{'start_s': episode.start, 'end_s': episode.end, 'hands': [
+        'trials': [{'start_s': own.episode.start, 'end_s': own.episode.end, 'hands': [
             {'name': hand.name, 'grip_fraction': place, 'closes_s': hand.start, 'opens_s': hand.end}
-            for hand, place in zip(episode.hands, episode.places, strict=True)], 'goals': len(trial.goals)}
-            for episode, trial in zip(cut, trials, strict=True)],
+            for hand, place in zip(own.episode.hands, own.episode.places, strict=True)],
+            'goals': len(own.trial.goals)} for own in trials],
         'lost': [list(span) for span in _lost(views)], 'problems': list(problems)}
 
 

@@ -33,7 +33,7 @@ PLACES = 101  # along the DLO at which a hand may hold it
 HELD = 0.012  # m; from a hand to the point that it holds, at most, over most of the movement
 BESIDE = 0.005  # of a grip's distance from its tag that counts as error: of places alike, the nearest is held
 TRUSTED = 0.9  # of the pictures of a movement; in the others, the tracker may be wrong
-AT_REST = 0.003  # m; nearer to where a hand closes, it stands there
+AT_REST = 0.0015  # m; nearer to where a hand closes, it stands there
 REACH = 0.25  # m from a tag to what the hand holds, at most
 LIFTED = 0.008  # m above the table
 #: A beam that is lifted by its diameter leaves the table at 6 to 12 diameters to either side, and with the
@@ -400,6 +400,11 @@ def _path(seen: Sightings, hold: _Hold, initial: Chain) -> Hand:
     if len(known) < 2:
         raise InputError('hand', f'{hold.hand.name}, which is hardly seen while it holds the DLO',
                          'a tag that the camera sees', 'glue it where the hand does not hide it')
+    if seen.cameras is not None and np.nanmax(places[known, 2]) - seen.radius < LIFTED:
+        # It drags the DLO over the table: where that meets the line of sight, the grip is known best.
+        cameras = seen.cameras[known]
+        share = (seen.radius - cameras[:, 2:]) / (places[known, 2:] - cameras[:, 2:])
+        places[known] = cameras + share * (places[known] - cameras)
     kept = [known[0]]
     for k in known[1:]:
         if seen.times[k] - seen.times[kept[-1]] >= PATH or k == known[-1]:

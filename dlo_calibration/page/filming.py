@@ -28,7 +28,7 @@ HANGS = 1.0  # s after a film's last goal in which the simulated DLO is still sh
 
 
 @dataclass
-class _Progress:
+class _FilmProgress:
     """How far the following of a film is."""
 
     identity: str
@@ -49,7 +49,7 @@ class FilmRoom:
         self._work: Background[tuple[str, Followed]] = Background('film')
         self._films: dict[str, Film] = {}
         self._problems: dict[str, str] = {}
-        self._progress: _Progress | None = None
+        self._progress: _FilmProgress | None = None
         self._waiting = [film.id for film in project.document.films if _marked(film)]
         self.followed: dict[str, Followed] = {}
 
@@ -93,7 +93,7 @@ class FilmRoom:
         except InputError as error:
             self._problems[identity] = str(error)
             return
-        progress = _Progress(identity, max(1, round(film.duration * film.frame_rate)), time.monotonic())
+        progress = _FilmProgress(identity, max(1, round(film.duration * film.frame_rate)), time.monotonic())
         self._progress = progress
 
         def on_image(done: int) -> None:

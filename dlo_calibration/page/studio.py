@@ -365,7 +365,8 @@ class Studio:
         first = len(drafts.trials)
         named = [replace(draft, trial=draft.trial and replace(draft.trial, name=_name(first + k)))
                  for k, draft in enumerate(filmed)]
-        return replace(drafts, trials=(*drafts.trials, *named), filmed_diameter=2.0 * self._film_room.radius or None)
+        return replace(drafts, trials=(*drafts.trials, *named),
+                       filmed_diameter=2.0 * self._film_room.radius or None)
 
     def _entry(self, identity: str) -> FilmEntry:
         """

@@ -36,7 +36,7 @@ Colour = tuple[float, ...]
 
 
 @dataclass(frozen=True)
-class Film:
+class ShownMotion:
     """
     A motion to show.
 
@@ -53,7 +53,8 @@ class Film:
     hands: tuple[tuple[Colour, Floats, tuple[bool, ...]], ...]
 
     @classmethod
-    def of(cls, name: str, trial: Trial, motion: Motion, colours: Mapping[str, str], radius: float) -> Film:
+    def of(cls, name: str, trial: Trial, motion: Motion, colours: Mapping[str, str],
+           radius: float) -> ShownMotion:
         """
         Return the film of a simulated motion.
 
@@ -70,7 +71,7 @@ class Film:
              tuple(state[hand][1] for state in states)) for hand in states[0]))
 
 
-def show(films: Sequence[Film], radius: float, table: float | None, scene: str = '',
+def show(films: Sequence[ShownMotion], radius: float, table: float | None, scene: str = '',
          on_open: Callable[[], None] = lambda: None) -> None:
     """
     Show motions, one after the other and again, until the user closes the window.
@@ -101,7 +102,7 @@ def show(films: Sequence[Film], radius: float, table: float | None, scene: str =
         process.join()
 
 
-def _show(parent: Connection, films: Sequence[Film], radius: float, table: float | None, scene: str,
+def _show(parent: Connection, films: Sequence[ShownMotion], radius: float, table: float | None, scene: str,
           clock: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep) -> None:
     """Open the window and show the films; this process ends with the window."""
     nowhere = os.open(os.devnull, os.O_WRONLY)  # PyBullet and OpenGL print what they find
@@ -126,7 +127,7 @@ def _show(parent: Connection, films: Sequence[Film], radius: float, table: float
 class _Stage:
     """The bodies in the window, enough for every film, because adding or removing a body takes a frame."""
 
-    def __init__(self, client: int, films: Sequence[Film], radius: float, table: float | None) -> None:
+    def __init__(self, client: int, films: Sequence[ShownMotion], radius: float, table: float | None) -> None:
         self._client = client
         points = np.concatenate([film.beads.reshape(-1, 3) for film in films])
         low, high = points.min(axis=0), points.max(axis=0)
@@ -158,7 +159,7 @@ class _Stage:
             physicsClientId=self._client)
         return bodies
 
-    def show(self, film: Film, clock: Callable[[], float], sleep: Callable[[float], None],
+    def show(self, film: ShownMotion, clock: Callable[[], float], sleep: Callable[[float], None],
              should_stop: Callable[[], bool]) -> bool:
         """Show a motion in real time; return whether to go on."""
         self._name = pybullet.addUserDebugText(
@@ -175,7 +176,7 @@ class _Stage:
             sleep(0.5 / FRAME_RATE)
         return True
 
-    def _show_frame(self, film: Film, frame: int, before: int) -> None:
+    def _show_frame(self, film: ShownMotion, frame: int, before: int) -> None:
         """Show a frame; `before` is the index of the previous frame, or -1."""
         points = film.beads[frame].tolist()
         for k, body in enumerate(self._beads):

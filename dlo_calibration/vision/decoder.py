@@ -95,7 +95,7 @@ class _Decoder:
                     break
                 if pixels.shape != (self.size[1], self.size[0], 3):
                     os._exit(CHANGED)
-                pixels = self._cv2.cvtColor(pixels, self._cv2.COLOR_BGR2RGB)
+                pixels = self._cv2.cvtColor(pixels[::self._step, ::self._step], self._cv2.COLOR_BGR2RGB)
                 faulthandler.cancel_dump_traceback_later()  # the parent may take its time
                 answers.write(FRAME.pack(self._time_of_next))
                 answers.write(memoryview(pixels).cast('B'))
@@ -110,6 +110,10 @@ class _Decoder:
             os._exit(UNREADABLE)
         self._film.set(self._cv2.CAP_PROP_ORIENTATION_AUTO, 1)
         self._last = self._time_of_next = -math.inf
+        # OpenCV turns a quarter of a turn the other way before 4.7.
+        quarter = round(self._film.get(self._cv2.CAP_PROP_ORIENTATION_META)) in (90, 270)
+        version = tuple(int(part) for part in self._cv2.__version__.split('.')[:2])
+        self._step = -1 if quarter and version < (4, 7) else 1
 
     def _search(self, begin: float) -> None:
         """Go to a frame at or before a time, if there is one."""

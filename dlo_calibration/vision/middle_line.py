@@ -343,12 +343,13 @@ def straighten(pixels: NDArray[np.uint8], line: Floats, half: Floats, offsets: F
     return Strip(line, normals, half, offsets, lab)
 
 
-def learn_colours(strip: Strip, inner: float, outer: tuple[float, float]) -> Singles:
+def learn_colours(strip: Strip, inner: float, outer: tuple[float, float], others: float = 0.0) -> Singles:
     """
     Return a table of the logarithm of the odds that a colour is the DLO's.
 
     :param inner: offsets below this count as the DLO.
     :param outer: offsets between these count as the ground, which may be in shadow, too.
+    :param others: share of each colour in what may come into the picture later.
     """
     far = np.abs(strip.offsets)
     of_dlo = _share(strip.lab[:, far <= inner].reshape(-1, 3))
@@ -356,7 +357,7 @@ def learn_colours(strip: Strip, inner: float, outer: tuple[float, float]) -> Sin
     shadows = sum((_share(outside * np.float32(k)) for k in DARKER), np.zeros(BINS))
     of_ground = 0.6 * _share(outside) + 0.4 / len(DARKER) * shadows
     least = UNKNOWN * of_dlo.mean() + 1e-7
-    logarithms: Singles = np.log((of_dlo + least) / (of_ground + least)).astype(np.float32).ravel()
+    logarithms: Singles = np.log((of_dlo + least) / (of_ground + others + least)).astype(np.float32).ravel()
     return np.asarray(np.clip(logarithms - np.float32(STRANGE), -MOST, MOST))
 
 
@@ -390,7 +391,7 @@ def edges(strip: Strip, along: float) -> Singles:
 
 
 def between_ends(pixels: NDArray[np.uint8], middle: Middle, clicks: Floats, near: float,
-                 spacing: float) -> tuple[Floats, NDArray[np.bool_], Floats]:
+                 spacing: float, clamped: bool = False) -> tuple[Floats, NDArray[np.bool_], Floats]:
     """
     Return the line (n, 2) between its ends, where it is sure (n,), and the strength of its edges (n,).
 
@@ -398,6 +399,7 @@ def between_ends(pixels: NDArray[np.uint8], middle: Middle, clicks: Floats, near
     :param clicks: (k, 2) [px].
     :param near: how far an end may be from its click [px], at least.
     :param spacing: of the points [px].
+    :param clamped: whether the DLO goes on beyond the first and the last click, hidden in clamps.
     """
     half = float(np.median(middle.half))
     near = max(near, 4 * half)
@@ -406,10 +408,11 @@ def between_ends(pixels: NDArray[np.uint8], middle: Middle, clicks: Floats, near
     for order in (1, -1):
         way = line[::order]
         arc = arc_lengths(way)
-        end = end_near(arc, middle.inside[::order], _arc_at(way, arc, clicks[::order][0]), near)
+        click = _arc_at(way, arc, clicks[::order][0])
+        end = click if clamped else end_near(arc, middle.inside[::order], click, near)
         if end is not None:
             line = _extended(way, arc, end, half)[::order]
-    line = _bridged(line, sure, middle.inside, clicks, 2 * half)
+    line = _bridged(line, sure, middle.inside, clicks, 2 * half, near)
     ends = []
     for order in (1, -1):
         way = line[::order]
@@ -419,7 +422,8 @@ def between_ends(pixels: NDArray[np.uint8], middle: Middle, clicks: Floats, near
         way = evenly(way[:int(np.searchsorted(arc, click + near)) + 2], END_STEP * half)
         arc = arc_lengths(way)
         part = straighten(pixels, way, np.full(len(way), half), np.linspace(-0.25, 0.25, 9))
-        end = end_near(arc, odds(middle.table, part.lab).mean(axis=1), click, near)
+        end = None if clamped else end_near(
+            arc, odds(middle.table, part.lab).mean(axis=1), click, near)
         end = click if end is None else edge_near(arc, part, end, EDGE * half)
         ends.append(float(end if order == 1 else whole - end))
     arc = arc_lengths(line)
@@ -439,8 +443,12 @@ def between_ends(pixels: NDArray[np.uint8], middle: Middle, clicks: Floats, near
 def _arc_at(line: Floats, arc: Floats, click: Floats) -> float:
     """Return the arc length at which the first half of a line (n, 2) passes a click (2,) [px]."""
     # The line may pass the click again, elsewhere.
-    distance = np.where(arc < arc[-1] / 2, np.linalg.norm(line - click, axis=1), np.inf)
-    return float(arc[np.argmin(distance)])
+    steps = np.diff(line, axis=0)
+    share = ((click - line[:-1]) * steps).sum(axis=1) / np.maximum((steps * steps).sum(axis=1), 1e-9)
+    share = np.clip(share, 0.0, 1.0)
+    distance = np.linalg.norm(line[:-1] + share[:, None] * steps - click, axis=1)
+    k = int(np.argmin(np.where(arc[:-1] < arc[-1] / 2, distance, np.inf)))
+    return float(arc[k] + share[k] * (arc[k + 1] - arc[k]))
 
 
 def gaps(sure: NDArray[np.bool_]) -> list[tuple[int, int]]:
@@ -501,9 +509,22 @@ def _beside_itself(line: Floats, arc: Floats, part: slice, width: float) -> bool
     return bool((distant & near).any())
 
 
+def _misses(points: Floats, clicks: Floats, near: float) -> NDArray[np.bool_]:
+    """Tell which clicks (k, 2) a smooth curve through points (n, 2) misses by more than `near` [px]."""
+    at = arc_lengths(points)
+    if not len(clicks) or (np.diff(at) <= 0).any():
+        return np.ones(len(clicks), dtype=bool)
+    curve = CubicSpline(at, points)(np.linspace(0.0, at[-1], 200))
+    return np.asarray(np.linalg.norm(clicks[:, None] - curve, axis=2).min(axis=1) > near)
+
+
 def _bridged(line: Floats, sure: NDArray[np.bool_], inside: Floats, clicks: Floats,
-             width: float) -> Floats:
-    """Return a line (n, 2) that is smooth where the DLO is hidden, and passes the clicks there."""
+             width: float, near: float) -> Floats:
+    """
+    Return a line (n, 2) that is smooth where the DLO is hidden, and there passes the clicks.
+
+    :param near: how far beside the DLO a click may be [px]: one that is no farther off changes nothing.
+    """
     bridged = line.copy()
     arc = arc_lengths(line)
     clicked = np.array([int(np.argmin(np.linalg.norm(line - click, axis=1))) for click in clicks])
@@ -522,6 +543,7 @@ def _bridged(line: Floats, sure: NDArray[np.bool_], inside: Floats, clicks: Floa
         before = np.arange(low, max(low - 5 * step, -1), -step)[::-1]
         after = np.arange(high, min(high + 5 * step, len(line)), step)
         through = clicks[(clicked >= first) & (clicked < last)]
+        through = through[_misses(np.concatenate([line[before], line[after]]), through, near)]
         points = np.concatenate([line[before], through, line[after]])
         at = arc_lengths(points)
         if (np.diff(at) <= 0).any():

@@ -16,7 +16,7 @@ topological ordering, 1969), and none of them is reached more cheaply through an
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.vision.ridge import Ridge, Singles
@@ -33,22 +33,23 @@ OFF = 25.0  # cost of a pixel off the ridge, where one on it costs 1
 STRONG = 0.55  # share of the ridge measure at the clicks from which on a move costs the least
 BEND = 0.6  # cost of a change of direction by a sixteenth of a turn; two sixteenths cost four times as much
 TURNS = np.arange(-2, 3)  # sixteenths of a turn, from one move to the next
-ASIDE = 1.0  # cost of each pixel between a click and the path
+ASIDE = 2.0  # cost of each pixel between a click and the path: more than along a ridge, less than off it
 CROSSED = 40.0  # cost by which another arrival at a click may be worse than the best
 MAXIMUM_STATES = 2_500_000  # to settle, about two seconds; along a DLO these are 2 to 50 thousand
 EDGE = 2  # px around the ridge that no path enters, as wide as the longest move
 
 
-def ridge_path(ridge: Ridge, clicks: Floats, reach: float) -> Floats:
+def ridge_path(ridge: Ridge, clicks: Floats, reach: ArrayLike) -> Floats:
     """
     Return the path (n, 2) [px of the photograph] along a ridge; empty: there is none.
 
     :param clicks: (k, 2) [px of the photograph], in order.
-    :param reach: how far beside the DLO a click may be [px of the photograph].
+    :param reach: how far beside the DLO all clicks, or (k,) each of them, may be [px of the photograph].
     """
     height, width = ridge.hessian.shape[:2]
     places = (np.asarray(clicks) + 0.5) / ridge.factor - 0.5
-    pixels = _Search(ridge, max(1.5, reach / ridge.factor)).along(np.clip(places, 0, (width - 1, height - 1)))
+    reaches = np.broadcast_to(np.maximum(1.5, np.asarray(reach) / ridge.factor), len(places))
+    pixels = _Search(ridge).along(np.clip(places, 0, (width - 1, height - 1)), reaches)
     return (pixels + 0.5) * ridge.factor - 0.5
 
 
@@ -58,12 +59,9 @@ class _Search:
 
     A ridge of H x W pixels gets an edge, so that it has P = (H + 4) (W + 4).  A state is d P + the pixel to
     which the move with the index d leads.
-
-    :param reach: how far a click may be from the path [px of the ridge].
     """
 
-    def __init__(self, ridge: Ridge, reach: float) -> None:
-        self._reach = reach
+    def __init__(self, ridge: Ridge) -> None:
         self._size = ridge.hessian.shape[1::-1]
         self._moves = _move_costs(ridge).ravel()  # of the move that leads to each state
         self._cost = np.full_like(self._moves, np.inf)  # of the best path to each state
@@ -75,12 +73,15 @@ class _Search:
         self._after = turned * self._pixels + self._steps[turned]  # (16, 5) states minus the pixel before
         self._budget = MAXIMUM_STATES
 
-    def along(self, places: Floats) -> Floats:
-        """Return the pixels (n, 2) of the path along (k, 2) clicks [px of the ridge]."""
-        states, costs = self._around(places[0])
+    def along(self, places: Floats, reaches: Floats) -> Floats:
+        """
+        Return the pixels (n, 2) of the path along (k, 2) clicks [px of the ridge].
+
+        :param reaches: (k,) how far each click may be from the path [px of the ridge].
+        """
+        (states, costs), *goals = map(self._around, places, reaches)
         parts = []
-        for goal in places[1:]:
-            near, aside = self._around(goal)
+        for near, aside in goals:
             reached = self._settle(states, costs, near, aside)
             parts.append((reached, self._before[reached]))
             costs = self._cost[near] + aside
@@ -99,13 +100,13 @@ class _Search:
         v, u = np.divmod(visited[::-1], self._width)
         return np.column_stack([u, v]) - float(EDGE)
 
-    def _around(self, place: Floats) -> tuple[Indices, Singles]:
+    def _around(self, place: Floats, reach: float) -> tuple[Indices, Singles]:
         """Return the states around a click, in all directions, and their costs."""
-        span = np.arange(-int(self._reach) - 1, int(self._reach) + 2)
+        span = np.arange(-int(reach) - 1, int(reach) + 2)
         x, y = np.meshgrid(*(np.round(place).astype(int)[:, None] + span))
         aside = np.hypot(x - place[0], y - place[1])
         width, height = self._size
-        near = (aside <= self._reach) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        near = (aside <= reach) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
         pixels = (y[near] + EDGE) * self._width + x[near] + EDGE
         states = np.arange(len(MOVES))[:, None] * self._pixels + pixels
         return states.ravel(), np.tile((aside[near] * ASIDE).astype(np.float32), len(MOVES))

@@ -78,6 +78,46 @@ def scale_from_points(pixels: ArrayLike, table: ArrayLike, size: tuple[int, int]
     return replace(scale, warnings=tuple(_warnings(scale, len(marked))))
 
 
+def scale_from_length(line: ArrayLike, length: float, size: tuple[int, int], lens: Lens | None = None,
+                      focal_length: float | None = None) -> Scale:
+    """
+    Return the scale of a photograph that looks squarely at a plane, from one length in this plane.
+
+    The plane's x points to the right in the photograph, its y up, and its origin is the line's first point.
+
+    :param line: (k, 2) along what has the length, k >= 2 [px].
+    :param length: [m].
+    :param size: width and height of the photograph [px].
+    :param lens: of the camera, calibrated; or else
+    :param focal_length: from the photograph's file [px].
+    :raises InputError: where the length is out of range.
+    """
+    if not SMALLEST <= length <= LARGEST:
+        raise InputError('scale', f'a length of {length:.3g} m', f'{SMALLEST:g} m to {LARGEST:g} m',
+                         'give it in metres')
+    known = lens is not None or focal_length is not None
+    lens = _plain_lens(size, focal_length or _ordinary(size)) if lens is None else lens.resized(size)
+    ideal = lens.undistorted(line)
+    pixels = float(np.linalg.norm(np.diff(ideal, axis=0), axis=1).sum())
+    if not pixels > 1.0:
+        raise InputError('scale', 'a length between two clicks at one place', 'clicks apart', 'move one')
+    distance = lens.matrix[0, 0] * length / pixels  # from the camera
+    return Scale(lens, np.diag([1.0, -1.0, -1.0]), distance * np.linalg.solve(lens.matrix, [*ideal[0], 1.0]),
+                 np.zeros(1), known)
+
+
+def _ordinary(size: tuple[int, int]) -> float:
+    """Return the focal length of an ordinary camera [px]."""
+    return ORDINARY_LENGTH / FILM_DIAGONAL * math.hypot(*size)
+
+
+def _plain_lens(size: tuple[int, int], length: float, first: float = 0.0) -> Lens:
+    """Return the lens with a focal length [px], and a first radial coefficient of distortion."""
+    middle = (size[0] - 1) / 2.0, (size[1] - 1) / 2.0
+    matrix = np.array([[length, 0.0, middle[0]], [0.0, length, middle[1]], [0.0, 0.0, 1.0]])
+    return Lens(size, matrix, np.array([first, 0.0, 0.0, 0.0]))
+
+
 @dataclass(frozen=True, eq=False)
 class _Problem:
     """
@@ -99,8 +139,7 @@ class _Problem:
 
     @cached_property
     def _prior(self) -> Floats:
-        ordinary = ORDINARY_LENGTH / FILM_DIAGONAL * math.hypot(*self.size)
-        return np.array([math.log(self.focal_length or ordinary), 0.0])
+        return np.array([math.log(self.focal_length or _ordinary(self.size)), 0.0])
 
     @cached_property
     def _deviations(self) -> Floats:
@@ -121,10 +160,7 @@ class _Problem:
         """Return the lens that parameters (p,) describe."""
         if self.lens is not None:
             return self.lens
-        (width, height), length = self.size, math.exp(parameters[6])
-        middle = (width - 1) / 2.0, (height - 1) / 2.0
-        matrix = np.array([[length, 0.0, middle[0]], [0.0, length, middle[1]], [0.0, 0.0, 1.0]])
-        return Lens(self.size, matrix, np.array([parameters[7], 0.0, 0.0, 0.0]))
+        return _plain_lens(self.size, math.exp(parameters[6]), parameters[7])
 
     def fit(self) -> tuple[Scale, float]:
         """Return the best solution, and its cost."""

@@ -28,7 +28,8 @@ FINEST = 1000.0  # px, the longer side of the finest level
 COARSEST = 64.0  # px, of the coarsest
 BLUR = 1.0  # px of a level, standard deviation of the derivatives
 WIDTH = 3.2  # px of a level: the width of a DLO that is traced there
-NEAR = 14.0  # px in a photograph of 4000 px: usual distance of a click from the DLO
+NEAR = 14.0  # px in a photograph of 4000 px: usual distance of a click from the DLO; up to FAR times as much
+FAR = 5.0
 STRONGEST = 0.85  # share of the strongest ridge that a wider level must have to be preferred
 GROUND = 0.8  # share of the pixels that count as the ground's
 ANGLES = np.arange(16) * (math.pi / 16)
@@ -128,16 +129,16 @@ def _at_clicks(level: Level, clicks: Floats) -> tuple[Floats, float, Floats]:
     across = np.column_stack([np.cos(ANGLES) ** 2, 2 * np.cos(ANGLES) * np.sin(ANGLES), np.sin(ANGLES) ** 2])
     candidates = []
     for u, v in (clicks + 0.5) / level.factor - 0.5:
-        left, right = max(0, int(u - reach)), min(width, int(u + reach) + 2)
-        top, bottom = max(0, int(v - reach)), min(height, int(v + reach) + 2)
+        left, right = max(0, int(u - FAR * reach)), min(width, int(u + FAR * reach) + 2)
+        top, bottom = max(0, int(v - FAR * reach)), min(height, int(v + FAR * reach) + 2)
         part = level.curvature[top:bottom, left:right].astype(float)
         y, x = np.mgrid[top:bottom, left:right]
         distance = np.hypot(x - u, y - v)
-        inside = distance <= max(reach, float(distance.min()))
+        inside = distance <= max(FAR * reach, float(distance.min()))
         turned = np.einsum('ak,nkc->nac', across, part[inside])
         # The derivative along the line is subtracted: a speck has as much along as across.
         along = np.roll(turned, len(ANGLES) // 2, axis=1)
-        weight = np.exp(-0.5 * (distance[inside] / reach) ** 2)[:, None]
+        weight = 1 / (1 + (distance[inside] / (2 * reach)) ** 2)[:, None]
         candidates.append((turned, along, weight))
 
     def pick(weights: Floats | None) -> Floats:

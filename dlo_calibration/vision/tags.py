@@ -29,7 +29,7 @@ QUIET = 0.003  # m
 
 NEAR = 2.5  # sides of a tag around where it was seen last, in which it is looked for first
 EVERYWHERE = 5  # pictures from one search of the whole picture to the next, while all tags are seen nearby
-CELL, EDGE = 6, 0.8  # px of a cell in the picture with which a tag is aligned, and blur of its edges
+CELL, EDGE = 6, 0.5  # px of a cell in the picture with which a tag is aligned, and blur of its edges
 ALIGNMENT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-5)
 CORNER = 0.1  # px, standard deviation of a corner; only its ratio to TURN counts
 TURN = np.deg2rad(15.0)  # by which a tag turns from one picture to the next
@@ -111,7 +111,9 @@ def _aligned(grey: Pixels, number: int, corners: Floats) -> Floats:
     reach = float(np.ptp(corners, axis=0).max()) / 3.0
     left, top = np.maximum(np.floor(corners.min(axis=0) - reach), 0).astype(int)
     right, bottom = np.ceil(corners.max(axis=0) + reach).astype(int)
-    piece = np.ascontiguousarray(grey[top:bottom, left:right], np.float32)
+    # A lens blurs light, and the camera takes about the square root of it; without its inverse, the black
+    # cells seem smaller by half a pixel.
+    piece = np.square(np.ascontiguousarray(grey[top:bottom, left:right], np.float32))
     view = cv2.getPerspectiveTransform(places, (corners - (left, top)).astype(np.float32)).astype(np.float32)
     try:
         _, view = cv2.findTransformECC(template, piece, view, cv2.MOTION_HOMOGRAPHY, ALIGNMENT, None, 1)

@@ -21,8 +21,9 @@ from dlo_calibration.vision.photograph import Pixels
 from dlo_calibration.vision.ridge import learn, levels
 from dlo_calibration.writing import whole
 
-NEAR_END = 40.0  # px in a photograph of 4000 px: how far from the DLO's end the first and last clicks may be
-CLICK = 16.0  # px in a photograph of 4000 px: how far beside the DLO a click may be
+NEAR_END = 90.0  # px in a photograph of 4000 px: how far from the DLO's end the first and last clicks may be
+CLICK = 80.0  # px in a photograph of 4000 px: how far beside the DLO a click may be
+APART = 0.4  # of the distance to the next click: beyond, it could stand for another place of the DLO
 SPACING = 3.0  # px between the points of a trace, in a photograph of 4000 px
 SEEN = 0.3  # share of the line that must be sure, else there is no DLO
 ABOVE = 1.35  # least ratio of the upper strand's edge strength to the lower one's
@@ -75,26 +76,28 @@ class Tracer:
         self._pixels = np.ascontiguousarray(pixels)
         self._levels = levels(self._pixels)
 
-    def trace(self, clicks: ArrayLike) -> Trace:
+    def trace(self, clicks: ArrayLike, clamped: bool = False) -> Trace:
         """
         Trace the DLO along clicks.
 
-        The line ends at the DLO's end if the first or last click is near one, else at the click.
+        The line ends at the DLO's end if the first or last click is near one, else at the click; that of a
+        DLO whose ends are clamped ends at the clicks, where it leaves the clamps.
 
-        :param clicks: (k, 2) [px], k >= 2, in order along the DLO, each at most some 16 px beside it.
+        :param clicks: (k, 2) [px], k >= 2, in order along the DLO, each at most 2 % of the longer side of the
+            photograph beside it.
         :raises InputError: if there are fewer than two clicks, one is outside the photograph, or there is no
             DLO along them.
         """
         places = self._checked(clicks)
         scale = max(self._pixels.shape[:2]) / 4000
         ridge = learn(self._levels, places)
-        rough = ridge_path(ridge, places, max(CLICK * scale, 3.0))
+        rough = ridge_path(ridge, places, _reaches(places, scale))
         if len(rough) < 2:
             raise _no_dlo()
         near = max(NEAR_END * scale, 2 * ridge.width)
         middle = fit(self._pixels, rough, ridge.width, near)
         line, sure, strength = between_ends(self._pixels, middle, places, NEAR_END * scale,
-                                            max(SPACING * scale, 1.0))
+                                            max(SPACING * scale, 1.0), clamped)
         if len(line) < 3 or sure.mean() < SEEN:
             raise _no_dlo()
         size = 2 * float(np.median(middle.half))
@@ -118,6 +121,13 @@ class Tracer:
             raise InputError('clicks', 'all at one place', 'at least two places',
                              'click on both ends of the DLO')
         return np.asarray(np.clip(places[distinct], 0, (width - 1, height - 1)))
+
+
+def _reaches(clicks: Floats, scale: float) -> Floats:
+    """Return how far beside the DLO each of (k, 2) clicks may be [px]."""
+    gaps = np.linalg.norm(np.diff(clicks, axis=0), axis=1)
+    nearest = np.minimum(np.append(gaps, np.inf), np.insert(gaps, 0, np.inf))
+    return np.asarray(np.maximum(np.minimum(CLICK * scale, APART * nearest), 3.0))
 
 
 def _no_dlo() -> InputError:

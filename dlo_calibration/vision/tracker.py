@@ -56,20 +56,28 @@ DRIFT = 0.15
 SIGMA = (0.5, 0.3, 0.1)  # half widths: standard deviation of the places that each of them gives
 STRETCH = 0.05  # of a segment's length: standard deviation; a part in the air looks longer
 BEND = 0.01  # half widths, standard deviation of a change of second differences from image to image
-FREE = 2.0  # half widths, standard deviation of the place where the line is expected
+FREE = (10.0, 1.5)  # half widths, deviation from where the line is expected: if an end is seen, or none
 STILL = 0.02  # the same along a part that does not move, while another part is in the air
 END = 0.15  # half widths, standard deviation of an end
 MOVES = 0.12  # half widths from image to image, from which on a part moves
 TOLERANCE = 0.006  # share of the length on a table that a line between two visible ends may lack
 UNSCALED = 0.04  # the same in a picture without a scale
-BEYOND = 10.0  # half widths around an end, within which it is looked for
+BLURRED = 3.0  # px that it may lack besides, as ends are blurred
+BEYOND = 6.0  # half widths behind the last part that looks like the DLO, from which on its end is looked for
+LONGEST_TIP = 14  # half widths by which the line may be too short
+FAN = np.radians(np.arange(-50.0, 51.0, 10.0))  # directions in which the DLO may go on
+REACHES = np.array([0.4, 0.8, 1.2, 1.6])  # half widths, where colours are read in each of them
+OTHERS = 5e-4  # share of each colour, e.g. of 2000 colours of hands: a rare colour of the DLO may be theirs
 SEEN = 0.35  # mean logarithm of the odds of a colour from which on the DLO is seen
+SIDES = np.array([-2.6, -2.2, -1.8, 1.8, 2.2, 2.6])  # half widths beside the DLO, where the ground is seen
+STRANGE = 16.0  # distance in L, a, b of what is behind an end, from which on it is probably covered
 APART = 0.6  # half widths between the line and where the image shows it, from which on it is not seen
 LEAST = 0.3  # share of the line that must be seen
-UNEXPLAINED = 0.06  # of the DLO's area: more of its colour elsewhere, near the line, is too much
+UNEXPLAINED = 0.06  # of the DLO's area: more of its colour elsewhere than usual is too much
+ADAPTED = 0.05  # share by which what is usual follows each image
 DAMPED = 0.7  # of the velocity that remains
 REDUCED = 4.0  # px, width of the DLO in the picture in which colours are counted
-ALIKE = 0.7  # logarithm of the odds from which on a pixel there has the DLO's colour
+ALIKE = 0.75  # share of the DLO's usual logarithm of the odds from which on a place there has its colour
 SEARCHES = 10  # images from one search of the whole picture to the next
 WRONG_LENGTH = 0.05  # share of the length by which a line that is found again may differ
 
@@ -143,7 +151,9 @@ class Tracker:
         self._length = float(arc[-1])
         self._half = half / float(np.median(self._finenesses(line)))  # in units of the length
         strip = straighten(pixels, line, np.full(count, half), np.arange(-2.4, 2.41, 0.08))
-        self._table = learn_colours(strip, 0.5, (1.4, 2.4))
+        self._table = learn_colours(strip, 0.5, (1.4, 2.4), OTHERS)
+        middle = straighten(pixels, line, np.full(count, half), np.linspace(-0.4, 0.4, 5))
+        self._alike = ALIKE * float(np.median(odds(self._table, middle.lab).mean(axis=1)))
         self._line = _Line(line, np.interp(np.linspace(0, 1, count), np.linspace(0, 1, len(trace.sure)),
                                            trace.sure) > 0.5, (True, True), 0.0)
         self._velocity: Floats = np.zeros_like(line)
@@ -157,13 +167,14 @@ class Tracker:
 
         :param pixels: (h, w, 3) RGB.
         :param elapsed: time since the image before, also where that was earlier [s]; not below 0.
-        :param scale: of this image; None only if there was none at the start.
+        :param scale: of this image; None: that of the image before.
         """
         if scale is not None and self._scale is not None and scale is not self._scale:
             moved = scale.to_pixels(self._scale.points(self._line.line))
             if np.isfinite(moved).all():
                 self._line = replace(self._line, line=moved)
-        self._scale = scale
+        if scale is not None:
+            self._scale = scale  # while nothing of the board is seen, the last one is the best guess
         before = self._line.line
         found = self._followed(pixels, before + self._velocity * elapsed, WIDER if self._lost_for else FAR[0])
         reason = self._doubt(pixels, found)
@@ -227,7 +238,9 @@ class Tracker:
                     for order in (1, -1)]
             line, accepted, excess = self._elastic(line, measured, quality / (sigma * usual) ** 2, expected,
                                                    ends, usual, fineness)
-        apart = np.linalg.norm(line - measured, axis=1) / usual
+        tangents = directions(line)
+        normals = np.column_stack([-tangents[:, 1], tangents[:, 0]])
+        apart = np.abs(((line - strip.at(chosen)) * normals).sum(axis=1)) / usual
         fineness = self._finenesses(line)
         half = self._half * np.append(fineness, fineness[-1])
         strip = straighten(pixels, line, half, np.linspace(-0.6, 0.6, 9))
@@ -270,8 +283,13 @@ class Tracker:
             logarithms[row, explained] = 0.0
 
     def _end(self, pixels: Pixels, line: Floats, half: Floats, measured: Floats,
-             quality: Floats) -> Floats | None:
-        """Return the place (2,) [px] of the end near the first point of a line; None: it is not seen."""
+             quality: Floats) -> tuple[Floats, float] | None:
+        """
+        Return the end near the first point of a line; None: it is not seen.
+
+        :returns: the place (2,) [px], and the distance in L, a, b of what is behind it from what is beside
+            it, which is large where something covers the DLO from there on.
+        """
         h = float(half[0])
         # The DLO's last part, as far as it is seen.
         near = np.flatnonzero(quality[:30] > 0.3)
@@ -281,51 +299,84 @@ class Tracker:
         part = measured[first:first + 8]
         towards = part[0] - part[-1]
         towards = towards / max(float(np.linalg.norm(towards)), 1e-9)
-        inner = measured[first:first + 14]
-        way = np.concatenate([[part[0] + BEYOND * h * towards], inner])
-        way = evenly(way, 0.2 * h)
+        tip, towards = self._tip(pixels, part[0], towards, h)
+        way = evenly(np.concatenate([tip[-1:] + BEYOND * h * towards, tip[::-1], measured[first:first + 14]]),
+                     0.2 * h)
         height, width = pixels.shape[:2]
         arc = arc_lengths(way)
-        inside = ((way > 0) & (way < (width - 1, height - 1))).all(axis=1)
-        if not inside[arc > (BEYOND - 4) * h].all():
+        inside = np.asarray(((way > 0) & (way < (width - 1, height - 1))).all(axis=1))
+        if not inside[arc > (BEYOND - 3) * h].all():
             return None
         strip = straighten(pixels, way, np.full(len(way), h), np.linspace(-0.25, 0.25, 5))
         logarithms = odds(self._table, strip.lab).mean(axis=1, dtype=float)
         logarithms[~inside] = -1.0
-        click = BEYOND * h
-        end = end_near(arc, logarithms, click, BEYOND * h * 0.98)
+        end = end_near(arc, logarithms, BEYOND * h, 5 * h + float(arc_lengths(tip)[-1]))
         if end is None:
             return None
         end = edge_near(arc, strip, end, 0.5 * h)
-        return np.asarray(along_line(way, arc, [end])[0])
+        # The ground beside the last part, and what is behind the end.
+        beside = straighten(pixels, way, np.full(len(way), h), SIDES).lab
+        last = (arc > end + 0.5 * h) & (arc < end + 5 * h)
+        behind = strip.lab[(arc < end - 0.8 * h) & (arc > end - 3.0 * h)].reshape(-1, 3)
+        if not len(behind) or not last.any():
+            return None
+        sides = [beside[last][:, part].reshape(-1, 3).mean(axis=0) for part in (slice(0, 3), slice(3, 6))]
+        strange = min(float(np.linalg.norm(behind.mean(axis=0) - side)) for side in sides)
+        return np.asarray(along_line(way, arc, [end])[0]), strange
+
+    def _tip(self, pixels: Pixels, begin: Floats, towards: Floats, half: float) -> tuple[Floats, Floats]:
+        """Follow the DLO's colour from a point (2,) [px]; return the points (n, 2) and the last direction."""
+        points = [begin]
+        for _ in range(LONGEST_TIP):
+            turned = np.stack([np.cos(FAN), np.sin(FAN)], axis=1)
+            ways = np.stack([turned @ (towards * (1, -1)), turned @ towards[::-1]], axis=1)
+            at = (points[-1] + half * REACHES[:, None] * ways[:, None]).astype(np.float32)
+            colours: Any = cv2.remap(pixels, at[..., 0], at[..., 1], cv2.INTER_LINEAR,
+                                     borderMode=cv2.BORDER_REPLICATE)
+            lab: Any = cv2.cvtColor(colours.astype(np.float32) / np.float32(255), cv2.COLOR_RGB2Lab)
+            logarithms = odds(self._table, lab).mean(axis=1, dtype=float)
+            best = int(np.argmax(logarithms - FAN ** 2))
+            if logarithms[best] < SEEN:
+                break
+            towards = ways[best]
+            points.append(points[-1] + half * towards)
+        return np.array(points), towards
 
     def _elastic(self, line: Floats, measured: Floats, across: Floats, expected: Floats,
-                 ends: list[Floats | None], half: float,
+                 ends: list[tuple[Floats, float] | None], half: float,
                  fineness: Floats) -> tuple[Floats, tuple[bool, bool], float]:
         """Return the elastic line, which of the ends it has, and the excess of its length."""
         count = len(line)
         lengths = self._length / (count - 1) * fineness
         known = Evidence(
-            measured, across, expected, np.full(count, 1.0 / (FREE * half) ** 2), 0.2 / (FREE * half) ** 2,
-            lengths, 1.0 / (STRETCH * float(lengths.mean())) ** 2, 1.0 / (BEND * half) ** 2, np.zeros((2, 2)),
-            np.zeros(2))
+            measured, across, expected, np.full(count, 1.0 / (FREE[0] * half) ** 2),
+            0.2 / (FREE[0] * half) ** 2, lengths, 1.0 / (STRETCH * float(lengths.mean())) ** 2,
+            1.0 / (BEND * half) ** 2, np.zeros((2, 2)), np.zeros(2))
         tolerance = UNSCALED if self._scale is None else TOLERANCE
+        tolerance += BLURRED / float(arc_lengths(line)[-1])
         accepted = [end is not None for end in ends]
+        places = np.array([line[k] if end is None else end[0] for k, end in zip((0, -1), ends, strict=True)])
+        strange = [0.0 if end is None else end[1] for end in ends]
+        covered = int(np.argmax(strange))
+        if all(accepted) and strange[covered] > STRANGE > strange[1 - covered]:
+            accepted[covered] = False
         fit, excess = line, 0.0
         while True:
-            places = np.array([line[k] if end is None else end for k, end in zip((0, -1), ends, strict=True)])
             weights = np.where(accepted, 1.0 / (END * half) ** 2, 0.0)
+            if not any(accepted):
+                known = replace(known, along=np.full(count, 1.0 / (FREE[1] * half) ** 2))
             fit = fitted(line, replace(known, ends=places, end_weights=weights))
             if not all(accepted):
                 return fit, (accepted[0], accepted[1]), 0.0
             excess = float((np.linalg.norm(np.diff(fit, axis=0), axis=1) / fineness).sum() / self._length - 1)
             if excess >= -tolerance:
                 break
-            # What covers an end makes the DLO look shorter.
-            tangents = directions(expected)
-            inwards = [float((places[0] - expected[0]) @ tangents[0]),
-                       float((expected[-1] - places[1]) @ tangents[-1])]
-            accepted[int(np.argmax(inwards))] = False
+            # What covers an end makes the DLO look shorter, and so does an end that is held in the air; both
+            # move.
+            moved = np.linalg.norm(places - self._line.line[[0, -1]], axis=1).tolist()
+            if abs(strange[0] - strange[1]) > STRANGE / 2:
+                moved = strange
+            accepted[int(np.argmax(moved))] = False
         if excess > tolerance:
             # A part in the air looks longer: it is one that moves, or is hidden.
             normals = np.column_stack([-directions(line)[:, 1], directions(line)[:, 0]])
@@ -346,32 +397,33 @@ class Tracker:
             return 'the DLO has left the picture: show it again'
         if found.seen.mean() < LEAST:
             return 'too little of the DLO is seen: take hands out of the way, and move it slowly'
-        if self._unexplained(pixels, found.line) > self._usual + UNEXPLAINED:
+        unexplained = self._unexplained(pixels, found.line)
+        if unexplained > self._usual + UNEXPLAINED:
             return 'the DLO is also where the line is not: move it slowly, or start again with new clicks'
+        # The picture of a camera in the hand shows more or less of other things.
+        self._usual += ADAPTED * (unexplained - self._usual)
         return ''
 
     def _mask(self, pixels: Pixels) -> tuple[Bools, int]:
-        """Return where a part of the picture, reduced, has the DLO's colour, and by what it was reduced."""
+        """Return where the picture, reduced, has the DLO's colour, and by what it was reduced."""
         factor = max(1, int(self._width() / REDUCED))
         lab: Any = cv2.cvtColor(pixels[::factor, ::factor].astype(np.float32) / np.float32(255),
                                 cv2.COLOR_RGB2Lab)
-        return np.asarray(odds(self._table, lab) > ALIKE), factor
+        # A mixture of colours, as of skin, has some pixels of the DLO's colour; the DLO has no others.
+        side = max(2, round(0.6 * self._width() / factor))
+        return np.asarray(cv2.blur(odds(self._table, lab), (side, side)) > self._alike), factor
 
     def _unexplained(self, pixels: Pixels, line: Floats) -> float:
-        """Return the area with the DLO's colour that is not near the line, as a share of the DLO's area."""
-        height, width = pixels.shape[:2]
+        """Return the area with the DLO's colour that is not at the line, as a share of the DLO's."""
         thick = self._width()
-        low = np.clip(line.min(axis=0) - 6 * thick, 0, (width - 2, height - 2)).astype(int)
-        high = np.clip(line.max(axis=0) + 6 * thick, low + 2, (width, height)).astype(int)
-        mask, factor = self._mask(pixels[low[1]:high[1], low[0]:high[0]])
+        mask, factor = self._mask(pixels)
         covered = np.zeros(mask.shape, np.uint8)
-        points = np.rint((line - low) / factor * 16).astype(np.int32)
-        cv2.polylines(covered, [points], False, 1, round(2.2 * thick / factor + 2), cv2.LINE_8, 4)
+        points = np.rint(line / factor * 16).astype(np.int32)
+        cv2.polylines(covered, [points], False, 1, round(2.5 * thick / factor + 2), cv2.LINE_8, 4)
         elsewhere: Any = (mask & (covered == 0)).astype(np.uint8)
-        # What is thicker than the DLO, or not much longer than thick, is another thing, such as a hand.
+        # What is thicker than the DLO, or not much longer than thick, is another thing, say a hand.
         kernel = np.ones((round(1.7 * thick / factor) + 1,) * 2, np.uint8)
         elsewhere &= 1 - cv2.morphologyEx(elsewhere, cv2.MORPH_OPEN, kernel)
-        elsewhere = cv2.morphologyEx(elsewhere, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
         _, _, parts, _ = cv2.connectedComponentsWithStats(elsewhere)
         areas = parts[1:, cv2.CC_STAT_AREA] * float(factor ** 2)
         return float(areas[areas > 2.0 * thick ** 2].sum()) / max(thick * float(arc_lengths(line)[-1]), 1.0)

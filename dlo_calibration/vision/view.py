@@ -27,7 +27,7 @@ from dlo_calibration.vision.pose import scale_from_points
 from dlo_calibration.vision.scale import Scale
 
 VIEWS = 8  # images that give the focal length, evenly over the film
-CORNER = 0.3  # px, standard deviation of a corner
+CORNER = 0.5  # px, standard deviation of a corner
 FOCAL, DISTORTION = 0.25, 0.05  # standard deviations, as in `pose`, before any image is seen
 ORDINARY = 26.0 / math.hypot(36.0, 24.0)  # focal length of the picture's diagonal, as in `pose`
 AGAIN = 30  # images from one search for the board to the next

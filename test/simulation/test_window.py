@@ -13,7 +13,7 @@ import pytest
 from dlo_calibration import Action, Goal, Hand, Trial
 from dlo_calibration.simulation import window
 from dlo_calibration.simulation.motion import Motion
-from dlo_calibration.simulation.window import Film, pybullet
+from dlo_calibration.simulation.window import pybullet, ShownMotion
 
 RISE = np.array([0.0, 0.0, 0.1])
 
@@ -26,7 +26,7 @@ def film():
     goals = (Goal(start, 1.0, stable=False, held_by=('h',)), Goal(start, 2.0))
     times = np.arange(0.0, 2.01, 0.5)
     chains = np.stack([start.points + min(time, 1.0) * RISE for time in times])
-    return Film.of('lift', Trial('lift', start, (action,), goals), Motion(times, chains, chains[-1:]),
+    return ShownMotion.of('lift', Trial('lift', start, (action,), goals), Motion(times, chains, chains[-1:]),
                    {'h': '#ff8000'}, 0.004)
 
 
@@ -73,7 +73,7 @@ def test_each_frame_is_shown_at_its_time(film, world):
 
 
 def test_films_of_different_dlos_share_the_stage(film, world):
-    short = Film('short', film.times, film.beads[:, :50], ())
+    short = ShownMotion('short', film.times, film.beads[:, :50], ())
     stage = window._Stage(world.client, [film, short], 0.004, None)
     ticks = count()
     assert stage.show(short, lambda: float(next(ticks)), lambda _: None, lambda: False)

@@ -67,7 +67,7 @@ class FilmedTrials:
 
     def tag(self, k):
         """Return the middle (3,) [m] and the rotation (3, 3) of the tag in image k."""
-        rotation = Rotation.from_euler('zx', [self.turns[k], -25.0], degrees=True).as_matrix()
+        rotation = Rotation.from_euler('ZX', [self.turns[k], -25.0], degrees=True).as_matrix()
         above = Rotation.from_euler('z', self.turns[k], degrees=True).apply(GRIP_TO_TAG)
         return self.grips[k] + above, rotation
 
@@ -99,7 +99,7 @@ def tag_picture(number):
 
 def film_camera(size=(1920, 1080)):
     """Return a camera that stands in front of the table."""
-    return Camera(size, 1500.0 * size[0] / 1920, tilt=0.45, distance=0.85, target=(0.27, -0.03))
+    return Camera(size, 1500.0 * size[0] / 1920, tilt=0.45, distance=0.95, target=(0.27, 0.0))
 
 
 def filmed_trials(moves=MOVES, rate=RATE, truth=None, seed=0):

@@ -67,21 +67,23 @@ def test_no_other_path_costs_less(seed):
                 cost = move_cost(ridge, (x, y), (i, j)) + bend_cost(d, after)
                 links.append(((y * width + x) * 16 + d, (j * width + i) * 16 + after, cost))
     y, x = (np.repeat(axis.ravel(), 16) for axis in np.mgrid[:height, :width])
-    begins, ends = (np.hypot(x - click[0], y - click[1]) * path.ASIDE for click in (first, last))
+    aside = [np.hypot(x - click[0], y - click[1]) for click in (first, last)]
+    begins, ends = (np.where(each <= reach, each * path.ASIDE, np.inf) for each in aside)
     source = 16 * width * height  # which leads to all states near the first click
-    links += [(source, k, begins[k]) for k in np.nonzero(begins <= reach)[0]]
+    links += [(source, k, begins[k]) for k in np.nonzero(np.isfinite(begins))[0]]
     rows, columns, costs = zip(*links, strict=True)
     graph = coo_array((costs, (rows, columns)), shape=(source + 1, source + 1)).tocsr()
-    least = (dijkstra(graph, indices=source)[:-1] + ends)[ends <= reach].min()
+    least = (dijkstra(graph, indices=source)[:-1] + ends).min()
 
     pixels = path.ridge_path(ridge, np.array([first, last]), reach).astype(int)
     pixels = [tuple(pixel) for pixel in pixels.tolist()]
     totals = []
-    for begin in zip(x[begins <= reach].tolist(), y[begins <= reach].tolist(), strict=True):
+    for begin in zip(*(axis[np.isfinite(begins)].tolist() for axis in (x, y)), strict=True):
         line = [begin, *pixels]
         if all(tuple(np.subtract(b, a).tolist()) in moves for a, b in pairwise(line)):
             directions = [moves.index(tuple(np.subtract(b, a).tolist())) for a, b in pairwise(line)]
-            totals.append(np.hypot(*np.subtract(begin, first)) + np.hypot(*np.subtract(pixels[-1], last))
+            totals.append(path.ASIDE * np.hypot(*np.subtract(begin, first))
+                          + path.ASIDE * np.hypot(*np.subtract(pixels[-1], last))
                           + sum(move_cost(ridge, a, b) for a, b in pairwise(line))
                           + sum(bend_cost(a, b) for a, b in pairwise(directions)))
     assert min(totals) == pytest.approx(least, rel=1e-6)

@@ -34,7 +34,7 @@ PITCH = 20  # px of a cell in the picture of a tag
 
 def picture(tags, noise=3.0, seed=0):
     """Return a picture of tags: number -> position and rotation in the table's frame."""
-    image = np.full((SIZE[1] * 2, SIZE[0] * 2), 150, np.uint8)
+    image = np.full((SIZE[1] * 2, SIZE[0] * 2), 90, np.uint8)  # of light
     margin = round(QUIET / TAG_SIDE * TAG_CELLS * PITCH)
     for number, (position, rotation) in tags.items():
         cells = np.kron(tag_cells(number), np.ones((PITCH, PITCH), np.uint8))
@@ -45,7 +45,7 @@ def picture(tags, noise=3.0, seed=0):
         edges = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32) * len(printed) - 0.5
         view = cv2.getPerspectiveTransform(edges, seen.astype(np.float32))
         cv2.warpPerspective(printed, view, image.shape[::-1], image, cv2.INTER_AREA, cv2.BORDER_TRANSPARENT)
-    image = cv2.resize(image, SIZE, interpolation=cv2.INTER_AREA).astype(float)
+    image = np.sqrt(cv2.resize(image, SIZE, interpolation=cv2.INTER_AREA) / 255.0) * 255.0
     image += np.random.default_rng(seed).normal(0, noise, image.shape)
     return np.repeat(np.clip(image, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
 
@@ -69,7 +69,7 @@ def test_a_tag_gives_the_pose_of_a_hand():
     for number, (position, turn) in tags.items():
         poses = tag_poses(found[number], SCALE)
         best = min(range(len(poses.errors)), key=lambda k: angle(poses.rotations[k], turn))
-        assert np.linalg.norm(poses.positions[best] - position) < 0.006
+        assert np.linalg.norm(poses.positions[best] - position) < 0.008
         assert angle(poses.rotations[best], turn) < 3.0
 
 
@@ -89,7 +89,7 @@ def test_the_path_of_a_tag_is_smooth_goes_on_over_short_gaps_and_leaves_out_long
     away = np.linalg.norm(path.positions[seen] - [place for place, _ in truth], axis=1)
     turned = [angle(Rotation.from_quat(quaternion).as_matrix(), rotation)
               for quaternion, (_, rotation) in zip(path.orientations[seen], truth, strict=True)]
-    assert np.sqrt(np.mean(away**2)) < 0.002
+    assert np.sqrt(np.mean(away**2)) < 0.0025
     assert np.mean(turned) < 2.0
 
 

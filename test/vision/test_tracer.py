@@ -176,3 +176,19 @@ def test_no_other_columns_have_a_larger_sum():
         best = max(sums, key=sums.get)
         assert tuple(chosen) == best
         assert mean == pytest.approx(sums[best] / 6)
+
+
+@pytest.mark.parametrize('more', [1, 2])
+def test_clicks_that_are_off_by_a_hundredth_of_the_picture_change_nothing(more):
+    example = scene(11, SIZE, off=0.0, **{**PLAIN, 'radius': 0.004})
+    ends = example.camera.project(example.curve[[0, -1]])
+    between = example.camera.project(example.curve[np.linspace(0, len(example.curve) - 1, 6 * more + 1)
+                                                   .astype(int)[1:-1]])
+    angles = np.random.default_rng(more).uniform(0, 2 * np.pi, len(between) + 2)
+    clicks = np.concatenate([ends[:1], between, ends[1:]])
+    rough = clicks + 0.01 * SIZE[0] * np.column_stack([np.cos(angles), np.sin(angles)])
+    tracer = Tracer(picture(example))
+    lines = [tracer.trace(given).pixels for given in (clicks, rough)]
+    points, off = distances(example, lines[1])
+    assert 1e3 * points[1:-1].mean() < 1.0 and 1e3 * off.max() < 2.0
+    assert np.linalg.norm(lines[0][[0, -1]] - lines[1][[0, -1]], axis=1).max() < 2.0

@@ -8,6 +8,7 @@
 #include "strands.hpp"
 #include "moments.hpp"
 #include "frame.hpp"
+#include "shapes.hpp"
 #include "scene_contact.hpp"
 
 namespace dlo {

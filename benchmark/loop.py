@@ -1,0 +1,135 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Bending stiffness from one photograph of a real wire that hangs in a loop.
+
+    python benchmark/loop.py [--data FOLDER]
+
+FOLDER (default: the folder adapteddlo_muj of DLO_DATA) has `black0.jpg` and `black0_data.pickle` of the
+public repository qj25/adapteddlo_muj (folder adapteddlo_muj/data/dlo_muj_real): a wire of 1.5 m between two
+horizontal clamps 0.12 m apart, and the pixels that its authors clicked along it.  They are not part of the
+package; without them, the benchmark says so and ends.  The wire is traced from 4 to 25 clicks along that
+annotation, exact or 40 pixels off; the two at the clamps are always exact, as the picture shows these places.
+EI is fitted to the line and to the annotation, with the clamps' direction from a click inside each, and to
+the line without these clicks.  The tables are printed, and written to benchmark/results/loop.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+import pickle
+from typing import Any
+
+from figures import HERE, machine, table
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from dlo_calibration import calibrate, Options
+from dlo_calibration.capture.hanging import hanging_chain, hanging_trial, NODES, straight_down, with_ends
+from dlo_calibration.vision.middle_line import along_line, arc_lengths
+from dlo_calibration.vision.photograph import read_photograph
+from dlo_calibration.vision.pose import scale_from_length
+from dlo_calibration.vision.tracer import Trace, Tracer
+
+Floats = NDArray[np.float64]
+
+LENGTH = 1.5  # m, from the source
+MASS = 0.0271812 * LENGTH  # kg, from the source's mass per length
+CLAMPS = ((1700.0, 431.0), (1400.0, 418.0))  # px, on the wire's middle inside both clamps
+POINTS = 51  # that the annotation has, and that are compared
+OFF = 40.0  # px, a hundredth of the picture: how far a person's clicks are off
+DRAWS = 5
+ALLOWED = {('numpy.core.multiarray', '_reconstruct'), ('numpy', 'ndarray'), ('numpy', 'dtype')}
+
+
+class Arrays(pickle.Unpickler):  # noqa: S301  # it makes arrays alone
+    """Reads lists of arrays, and refuses all else that a pickle may hold."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        """Return the class of an array."""
+        if (module, name) not in ALLOWED:
+            raise pickle.UnpicklingError(f'{module}.{name} is no array')
+        return super().find_class(module, name)
+
+
+def annotation(path: Path) -> Floats:
+    """Return the pixels (51, 2) that the authors clicked, evenly along the wire."""
+    with path.open('rb') as stream:
+        _, (pixels, start) = Arrays(stream).load()
+    return np.asarray(pixels, float) + start
+
+
+def evenly(line: Floats) -> Floats:
+    """Return POINTS points evenly along a line (n, 2)."""
+    along = arc_lengths(line)
+    return along_line(line, along, np.linspace(0.0, along[-1], POINTS))
+
+
+def stiffness(trace: Trace, size: tuple[int, int], in_clamps: bool = True) -> tuple[float, float, float]:
+    """Return EI from a line, with the bounds of its interval [N m^2]."""
+    scale = scale_from_length(trace.pixels, LENGTH, size)
+    chain = hanging_chain(trace, scale, straight_down(scale, trace.pixels), 41,
+                          clamps=CLAMPS if in_clamps else None)
+    options = Options.of({'mass': with_ends(MASS), 'nodes': NODES})
+    result = calibrate([hanging_trial('trial 1', chain)], options)
+    found = result.parameters['flexibility']
+    return found.physical_value, found.physical_lower, found.physical_upper
+
+
+def main() -> None:
+    """Make the tables."""
+    parser = argparse.ArgumentParser(description=__doc__.partition('\n\n')[0].strip())
+    data = Path(os.environ.get('DLO_DATA', HERE.parent.parent / 'shared' / 'data')) / 'adapteddlo_muj'
+    parser.add_argument('--data', type=Path, default=data, help='folder of the photograph and its annotation')
+    folder = parser.parse_args().data
+    files = folder / 'black0.jpg', folder / 'black0_data.pickle'
+    if not all(file.exists() for file in files):
+        print(f'skipped: {files[0].name} and {files[1].name} of qj25/adapteddlo_muj are not in {folder}')
+        return
+    photograph = read_photograph(files[0], 'photograph')
+    truth = annotation(files[1])
+    metres = LENGTH / arc_lengths(truth)[-1]
+    tracer = Tracer(photograph.pixels)
+    rows, lines = [], {}
+    for count in (4, 9, 25):
+        for off in (0.0, OFF):
+            distances = []
+            for draw in range(DRAWS if off else 1):
+                angles = np.random.default_rng(draw).uniform(0.0, 2.0 * np.pi, count)
+                moved = off * np.column_stack([np.cos(angles), np.sin(angles)])
+                moved[[0, -1]] = 0.0
+                places = along_line(truth, arc_lengths(truth),
+                                    np.linspace(0.0, arc_lengths(truth)[-1], count))
+                trace = tracer.trace(places + moved, clamped=True)
+                lines.setdefault((count, off), trace)
+                distances.append(np.linalg.norm(evenly(trace.pixels) - truth, axis=1) * metres)
+            worst = max(each.mean() for each in distances)
+            rows.append((count, f'{off:g}', f'{1e3 * np.mean(distances):.2f}', f'{1e3 * worst:.2f}',
+                         f'{1e3 * np.max(distances):.1f}'))
+    smooth = CubicSpline(arc_lengths(truth), truth)(np.linspace(0.0, arc_lengths(truth)[-1], 2000))
+    reference = Trace(smooth, np.ones(len(smooth), dtype=bool), 0.0, ())
+    fits = []
+    for name, line in (('the annotation', reference), ('4 exact clicks', lines[4, 0.0]),
+                       (f'4 clicks {OFF:g} px off', lines[4, OFF]),
+                       (f'25 clicks {OFF:g} px off', lines[25, OFF])):
+        fits.append((name, *stiffness(line, photograph.size)))
+    name = '4 exact clicks, none inside the clamps'
+    fits.append((name, *stiffness(lines[4, 0.0], photograph.size, in_clamps=False)))
+    text = '\n\n'.join([
+        table(('clicks', 'off, px', 'mean distance to the annotation, mm', 'of the worst draw, mm',
+               'worst point, mm'), rows),
+        table(('EI fitted to', 'N m^2', '90 % interval, N m^2', 'relative to the annotation'),
+              [(name, f'{value:.3g}', f'{lower:.3g} to {upper:.3g}',
+                f'{100 * (value / fits[0][1] - 1):+.1f} %') for name, value, lower, upper in fits])])
+    how = 'One photograph of a real wire; points are compared evenly along both lines, end to end.'
+    (HERE / 'results' / 'loop.md').write_text(
+        f'# loop\n\n`python benchmark/loop.py`\n\n{how} {machine()}\n\n{text}\n', encoding='utf-8')
+    print(text)
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,190 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The tracker follows a DLO in small rendered films, whose truth is known, and says what it does not see."""
+
+from dataclasses import replace
+import functools
+
+from films import Instant, plain_look, Renderer
+import numpy as np
+from photographs import Camera, Hand
+import pytest
+
+from dlo_calibration.vision.lens import Lens
+from dlo_calibration.vision.scale import Scale
+from dlo_calibration.vision.tracker import Tracker
+
+LENGTH, RADIUS = 0.5, 0.005  # m
+COUNT = 21
+CAMERA = Camera((640, 480), 620.0, 0.3, 0.1, 0.0, 0.8, (0.25, 0.0))
+STEP = 1 / 30  # s
+FAR = 0.004  # m: half a diameter is 5 mm
+
+
+@functools.cache
+def renderer():
+    return Renderer(plain_look(), RADIUS, (-0.3, -0.5), (0.8, 0.5))
+
+
+def bent(amount, shift=(0.0, 0.0)):
+    """Return a DLO (n, 3) [m] of the same length whose curvature grows with the amount."""
+    arc = np.linspace(0.0, LENGTH, 401)
+    angle = amount * np.sin(2 * np.pi * arc / LENGTH)
+    steps = np.column_stack([np.cos(angle), np.sin(angle)]) * LENGTH / 400
+    flat = np.concatenate([[[0.0, 0.0]], np.cumsum(steps[:-1], axis=0)]) + shift
+    return np.column_stack([flat, np.full(len(flat), RADIUS)])
+
+
+def points_of(curve):
+    """Return the points (COUNT, 3) that the tracker should find."""
+    return curve[np.linspace(0, len(curve) - 1, COUNT).round().astype(int)]
+
+
+def scale_of(camera):
+    lens = Lens(camera.size, camera.matrix, np.zeros(4))
+    return Scale(lens, camera.rotation, -camera.rotation @ camera.position, np.zeros(1), True)
+
+
+def tracked(curves, hands=None, camera=CAMERA, drawn=None, scaled=True):
+    """Return what is tracked in the images of curves."""
+    tracker, listed = Tracker(COUNT), []
+    scale = scale_of(camera) if scaled else None
+    drawn = drawn or (lambda pixels, k: pixels)
+    for k, curve in enumerate(curves):
+        pixels = drawn(renderer().image([Instant(camera, curve, hands[k] if hands else ())]), k)
+        if k == 0:
+            clicks = camera.project(points_of(curve)[::5]) + 2.0
+            listed.append(tracker.start(pixels, clicks, scale))
+        else:
+            listed.append(tracker.next(pixels, STEP, scale))
+    return listed
+
+
+def errors(found, curve, camera=CAMERA):
+    """Return the distance (COUNT,) on the table of each tracked point from where it is [m]."""
+    points = scale_of(camera).points(found.pixels, RADIUS)
+    return np.linalg.norm((points - points_of(curve))[:, :2], axis=1)
+
+
+def moving(count):
+    """Return curves that bend, and move across at 0.4 m/s."""
+    return [bent(0.3 + 0.5 * k / count, (0.0, 0.4 * STEP * k)) for k in range(count)]
+
+
+@pytest.mark.parametrize('scaled', [True, False])
+def test_points_stay_on_their_material(scaled):
+    curves = moving(10)
+    found = tracked(curves, scaled=scaled)
+    for one, curve in zip(found, curves, strict=True):
+        assert not one.lost
+        off = errors(one, curve)
+        assert np.isfinite(off[1:-1]).all()
+        # Without a scale, perspective makes parts that are nearer longer.
+        assert np.nanmean(off) < (0.0015 if scaled else 0.008)
+        assert np.nanmax(off) < (FAR if scaled else 0.02)
+    wide = 2 * RADIUS * CAMERA.focal_length / CAMERA.distance
+    assert found[-1].width == pytest.approx(wide, rel=0.3)
+
+
+def test_time_can_run_backwards():
+    curves = moving(10)[::-1]
+    assert np.nanmax(errors(tracked(curves)[-1], curves[-1])) < FAR
+
+
+def test_what_a_hand_hides_is_not_a_number_and_the_rest_is_right():
+    curves = [bent(0.5)] * 10
+    hands = [(Hand((0.25, -0.13 + 0.03 * k)),) for k in range(10)]
+    found = tracked(curves, hands)
+    off = errors(found[-1], curves[0])
+    assert np.isnan(off[8:13]).any()
+    assert np.isfinite(off[1:6]).all() and np.isfinite(off[16:-1]).all()
+    assert np.nanmax(off) < FAR
+
+
+def test_a_hidden_end_does_not_shift_the_points():
+    curves = [bent(0.3)] * 10
+    hands = [(Hand((0.49, -0.14 + 0.016 * k), -1.2),) for k in range(10)]
+    found = tracked(curves, hands)
+    off = errors(found[-1], curves[0])
+    assert np.isnan(off[-1])
+    assert np.nanmax(off) < FAR
+
+
+def test_a_crossing_keeps_the_order():
+    arc = np.linspace(0.0, LENGTH, 401)
+    curves = []
+    for k in range(16):
+        # A loop in the middle that slides along.
+        bump = np.exp(-(((arc - 0.2 - 0.004 * k) / 0.085) ** 4))
+        angle = 5.2 * np.cumsum(bump) / bump.sum() - 2.6
+        flat = np.cumsum(np.column_stack([np.cos(angle), np.sin(angle)]), axis=0) * LENGTH / 400
+        flat += (0.25, 0.05) - flat[200]
+        height = RADIUS + 2 * RADIUS * np.exp(-(((arc - arc[-1]) / 0.2) ** 2))
+        curves.append(np.column_stack([flat, height]))
+    found = tracked(curves)
+    for one, curve in zip(found, curves, strict=True):
+        assert not one.lost
+        on_table = curve[np.linspace(0, 400, COUNT).round().astype(int), 2] < RADIUS + 0.001
+        off = errors(one, curve)[on_table]
+        # The loop slides, and the points with it; on the wrong strand they would be 0.1 m and more away.
+        assert np.nanmax(off) < 0.03
+        assert np.isfinite(off).mean() > 0.7
+
+
+def test_a_dlo_that_leaves_the_picture_and_comes_back():
+    ways = np.concatenate([np.arange(0, 18), np.arange(18, -1, -1)]) * 0.012
+    curves = [bent(0.3, (0.1 + way, 0.0)) for way in ways]
+    found = tracked(curves)
+    outside = found[18]
+    true = CAMERA.project(points_of(curves[18]))
+    gone = true[:, 0] > CAMERA.size[0]
+    assert gone.any()
+    assert np.isnan(outside.pixels[gone]).all()
+    assert np.nanmax(errors(outside, curves[18])) < 2 * FAR
+    assert np.nanmax(errors(found[-1], curves[-1])) < FAR
+
+
+def test_blur_is_no_obstacle():
+    curves = moving(8)
+    rendered = renderer()
+    before = rendered._look
+    rendered._look = replace(before, blur=2.5)
+    try:
+        found = tracked(curves)
+    finally:
+        rendered._look = before
+    assert np.nanmax(errors(found[-1], curves[-1])) < 2 * FAR
+
+
+def test_a_dlo_that_is_covered_is_lost_with_a_reason_and_found_again():
+    curves = [bent(0.4)] * 12
+    covered = range(3, 6)
+
+    def drawn(pixels, k):
+        return np.full_like(pixels, 90) if k in covered else pixels
+
+    found = tracked(curves, drawn=drawn)
+    for k, one in enumerate(found):
+        assert one.lost == (k in covered)
+        assert bool(one.reason) == one.lost
+        if one.lost:
+            assert np.isnan(one.pixels).all()
+    assert np.nanmax(errors(found[-1], curves[-1])) < FAR
+
+
+def test_a_dlo_that_was_put_elsewhere_meanwhile_is_found_by_itself():
+    curves = [bent(0.4, (0.0, -0.1))] * 3 + [None] * 3 + [bent(-0.5, (0.03, 0.12))] * 25
+    found = tracked(curves)
+    assert not found[2].lost
+    assert found[5].lost
+    assert not found[-1].lost
+    assert np.nanmax(errors(found[-1], curves[-1])) < FAR
+    for one, curve in zip(found[6:], curves[6:], strict=True):
+        assert one.lost or np.nanmax(errors(one, curve)) < 2 * FAR
+
+
+def test_a_picture_of_something_else_is_never_called_tracked():
+    curves = [bent(0.4)] * 2 + [None] * 12
+    found = tracked(curves)
+    assert all(one.lost for one in found[2:])
