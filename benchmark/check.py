@@ -4,13 +4,14 @@
 """
 Check new sessions of the reference objects: unchanged, and with EI or friction 20 % off.
 
-    python benchmark/check.py [--draws 20] [--noise 0.0003] [--objects 1 2 5] [--workers 2]
+    python benchmark/check.py [--draws 20] [--noise 0.0003] [--objects 1 2 5] [--workers 2] [--other]
 
 Each draw calibrates on four actions with new noise, and checks the result on the same four actions with other
 noise: as they are, with EI 20 % larger or smaller, and with friction 20 % larger or smaller.  Unchanged
 chains are the exact ones; before and after a change, they are those of a finer simulation.  Checks in which
 both sessions together do not determine the changed parameter to 5 % are not counted.  The table is printed,
-and written to benchmark/results/check.md.  Reads the folder reference of DLO_DATA.
+and written to benchmark/results/check.md; with `--other`, one of checks of the unchanged objects on the five
+other actions, to check_other.md.  Reads the folder reference of DLO_DATA.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ import multiprocessing
 from pathlib import Path
 import sys
 import time
-from typing import Mapping
+from typing import Mapping, Sequence
 
 import numpy as np
 
@@ -44,6 +45,7 @@ from dlo_calibration.workspace.check import AGREES, Check, checked, HAS_CHANGED 
 OFF = 0.2  # share of a change
 SHARP = 0.05 * 2**0.5  # of the change: half its 90 % interval, where both sessions determine it to 5 %
 CASES = ('unchanged', 'flexibility', 'friction')
+OTHER = 'other actions'
 
 
 @dataclass(frozen=True)
@@ -77,10 +79,11 @@ def simulated(trials: list[Trial], physical: Mapping[str, float]) -> list[Trial]
         trial.goals, simulator.simulate(trial, physical).chains, strict=True))) for trial in trials]
 
 
-def draw(name: str, noise: float, seed: int) -> dict[str, Outcome]:
+def draw(name: str, noise: float, cases: Sequence[str], seed: int) -> dict[str, Outcome]:
     """Calibrate on one draw of the noise, and check the result in all cases."""
-    properties, exact = exact_trials(name)
-    exact = [trial for trial in exact if trial.name in FITTED]
+    properties, everything = exact_trials(name)
+    exact = [trial for trial in everything if trial.name in FITTED]
+    other = [trial for trial in everything if trial.name not in FITTED]
     length = float(np.mean([trial.initial.length for trial in exact]))
     physical = {**ParameterSpace(mass=properties['mass']).physical({}, length),
                 **{name: properties[key] for name, key in TRUTH.items()}}
@@ -88,9 +91,9 @@ def draw(name: str, noise: float, seed: int) -> dict[str, Outcome]:
     options = Options(mass=properties['mass'], seed=seed, workers=1)
     factor = 1 + OFF if seed % 2 else 1 - OFF
     outcomes = {}
-    for case in CASES:
-        before, after = exact, exact
-        if case != CASES[0]:
+    for case in cases:
+        before, after = exact, other if case == OTHER else exact
+        if case in CASES[1:]:
             before = simulated(exact, physical)
             after = simulated(exact, {**physical, case: factor * physical[case]})
         setting = Setting(tuple(noisy(before, noise, generator)), options, CompiledSimulator())
@@ -100,7 +103,7 @@ def draw(name: str, noise: float, seed: int) -> dict[str, Outcome]:
         named = () if check.comparison is None else tuple(
             name for name, there in zip(check.validation.space.free, check.comparison.changed, strict=True)
             if there)
-        asked = CASES[1:] if case == CASES[0] else (case,)
+        asked = (case,) if case in CASES[1:] else CASES[1:]
         outcomes[case] = Outcome(check.comparison is not None and all(
             width(check, name) <= SHARP for name in asked), check.verdict, named, time.perf_counter() - begun)
     return outcomes
@@ -123,13 +126,15 @@ def main() -> None:
     parser.add_argument('--noise', type=float, default=3e-4, help='standard deviation of a coordinate [m]')
     parser.add_argument('--objects', type=int, nargs='+', default=[1, 2, 3, 4, 5])
     parser.add_argument('--workers', type=int, default=2)
+    parser.add_argument('--other', action='store_true')
     options = parser.parse_args()
+    cases, title = ((OTHER,), 'check_other') if options.other else (CASES, 'check')
     rows = ['| object | case | checks | of these determined to 5 % | agrees | changed | cannot tell '
             '| changed, and the right one named | and no other | seconds, median |', '|' + '---|' * 10]
-    total: dict[str, list[Outcome]] = {case: [] for case in CASES}
+    total: dict[str, list[Outcome]] = {case: [] for case in cases}
 
     def row(name: str, case: str, outcomes: list[Outcome]) -> str:
-        counted = [each for each in outcomes if each.sharp or case == CASES[0]]
+        counted = [each for each in outcomes if each.sharp or case not in CASES[1:]]
         right = sum(case in each.named for each in counted)
         only = sum(each.named == (case,) for each in counted)
         agree = sum(each.verdict == AGREES for each in counted)
@@ -140,20 +145,23 @@ def main() -> None:
 
     with ProcessPoolExecutor(options.workers, multiprocessing.get_context('spawn')) as executor:
         for k in options.objects:
-            draws = list(executor.map(partial(draw, f'object{k}', options.noise), range(options.draws)))
-            for case in CASES:
+            draws = list(executor.map(partial(
+                draw, f'object{k}', options.noise, cases), range(options.draws)))
+            for case in cases:
                 outcomes = [each[case] for each in draws]
                 total[case] += outcomes
                 rows.append(row(str(k), case, outcomes))
-            print(*rows[-3:], sep='\n', flush=True)
-    rows += [row('all', case, total[case]) for case in CASES]
-    text = (f'# check\n\n`python benchmark/check.py --draws {options.draws} --noise {options.noise} '
-            f'--objects {" ".join(map(str, options.objects))}`: four actions of each object, with '
+            print(*rows[-len(cases):], sep='\n', flush=True)
+    rows += [row('all', case, total[case]) for case in cases]
+    text = (f'# {title}\n\n`python benchmark/check.py --draws {options.draws} --noise {options.noise} '
+            f'--objects {" ".join(map(str, options.objects))}{" --other" * options.other}`: four actions of '
+            'each object'
+            f'{", checked on the five others" * options.other}, with '
             f'new noise of {1e3 * options.noise:g} mm per coordinate in each session. In the rows of a '
             'change, only checks whose sessions determine the changed parameter to 5 % each are counted as '
             'agrees, changed or cannot tell.\n\n' + '\n'.join(rows) + '\n')
-    (HERE / 'results' / 'check.md').write_text(text, encoding='utf-8')
-    print(*rows[-3:], sep='\n')
+    (HERE / 'results' / f'{title}.md').write_text(text, encoding='utf-8')
+    print(*rows[-len(cases):], sep='\n')
 
 
 if __name__ == '__main__':

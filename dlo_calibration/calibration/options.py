@@ -225,6 +225,7 @@ class Options(DeclaredOptions):
     sessions: str = declared(
         '', 'numbers of trials of each of several sessions of one DLO, in their order, e.g. 4 3; fit with '
         'several sessions sets it; empty: all trials are of one session', of=OBSERVATION)
+    measured_by: str = declared('', 'who measured, for the passport of the result', of=OBSERVATION)
     parts: int = declared(
         0, 'number of parts of equal length, each with its own bending stiffness; 0: chosen by '
         'cross-validation, like the rest shape of a DLO in clamps that resists twist (search least_squares; '

@@ -22,6 +22,7 @@ from dlo_calibration.inference.advice import Advice
 from dlo_calibration.inference.examination import Confirmation, DISTANCE_TOLERANCE, Examination
 from dlo_calibration.inference.missing_parameters import MissingParameter, PARTS
 from dlo_calibration.inference.outlier import Outlier, SOMETHING_ELSE
+from dlo_calibration.inference.together import known_together, Together
 from dlo_calibration.inference.uncertainty import (
     DEVIATIONS,
     IDENTIFIABLE,
@@ -297,6 +298,15 @@ class CalibrationResult:
         return tuple(combination(self.space.free, vector)
                      for vector in self.examination.uncertainty.undetermined)
 
+    @property
+    def together(self) -> tuple[Together, ...]:
+        """The pairs of parameters that are known only together."""
+        if self.examination is None or not self.examination.regular or self.unusable:
+            return ()
+        uncertainty = self.examination.uncertainty
+        return () if uncertainty.local is None else known_together(
+            self.space.free, uncertainty.local, uncertainty.std)
+
     def physical(self) -> dict[str, float]:
         """Physical values of all parameters in SI units, for a DLO of the observed length."""
         return self.space.physical(self.values, self.length)
@@ -420,6 +430,7 @@ def plain(result: CalibrationResult) -> dict[str, Any]:
             'std', 'expected_std', 'lower', 'upper')}},
         'explanations': {missing.name: missing.share for missing in result.missing_parameters},
         'undetermined': result.undetermined,
+        'together': [{**asdict(pair), 'words': pair.words} for pair in result.together],
         'confirmation': other and {
             'engine': other.engine, **_fit(other.score, other.scores, other.errors),
             'mean_distance_m': other.mean_distance, 'max_distance_m': other.max_distance}})

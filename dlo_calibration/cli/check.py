@@ -32,5 +32,6 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     if chosen.json:
         print_json(plain_check(check))
     else:
-        print_sentences([f'{check.verdict[0].upper()}{check.verdict[1:]}.', *check.words])
+        print_sentences([f'{check.verdict[0].upper()}{check.verdict[1:]}.', *check.words,
+                         *filter(None, [file.passport.words])])
     return 0

@@ -31,6 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     """Execute the verb; return the exit code."""
     from dlo_calibration.report.animation import write_animations
+    from dlo_calibration.report.before_after import films, write_films
     from dlo_calibration.report.drawing import write_pictures
 
     if chosen.animation and chosen.result is None:
@@ -47,13 +48,17 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     obstacles = obstacles_of(source.options)
     pictures = write_pictures(trials, None if result is None else result.chains, chosen.output,
                               print_message, numbers, obstacles)
+    moving: list[Path] = []
     animations: list[Path] = []
+    if result is not None:
+        drawn = films(result, range(len(trials)), source.options, make_simulator)
+        moving = write_films(drawn, chosen.output, print_message, numbers)
     if chosen.animation and result is not None:
         physical = result.space.physical(result.values, result.length)  # of the first session
         with closing(make_simulator(source.options)) as simulator:
             animations = write_animations(result.trials, simulator, physical, chosen.output,
                                           print_message, numbers, obstacles)
     if chosen.json:
-        print_json({'pictures': [str(path) for path in pictures],
+        print_json({'pictures': [str(path) for path in pictures], 'films': [str(path) for path in moving],
                     'animations': [str(path) for path in animations]})
     return 0

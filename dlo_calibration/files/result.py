@@ -20,6 +20,7 @@ from typing import Any, Mapping, Sequence
 
 from dlo_calibration.calibration.choice import DECIDED
 from dlo_calibration.calibration.options import FileOptions
+from dlo_calibration.calibration.passport import Passport, UNKNOWN
 from dlo_calibration.calibration.result import CalibrationResult, evaluation_rows, ParameterEstimate, plain
 from dlo_calibration.files import xml
 from dlo_calibration.inference.examination import Confirmation
@@ -51,6 +52,7 @@ class Description:
     :param trials: names of the trials.
     :param scores: difference score of each trial [cm].
     :param confirmation: fit of a second engine with the same parameters; None: there was no second engine.
+    :param passport: where the result comes from; an empty one: unknown.
     """
 
     parameters: Mapping[str, ParameterEstimate]
@@ -75,13 +77,15 @@ class Description:
     unusable: str = ''
     warnings: tuple[str, ...] = ()
     confirmation: Confirmation | None = None
+    passport: Passport = UNKNOWN
 
     def __post_init__(self) -> None:
         for name in ('parameters', 'fixed'):
             object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
 
     @classmethod
-    def of(cls, result: CalibrationResult, options: Mapping[str, Any] | None = None) -> Description:
+    def of(cls, result: CalibrationResult, options: Mapping[str, Any] | None = None,
+           passport: Passport = UNKNOWN) -> Description:
         """Return the definition of the DLO that a calibration found."""
         space, values = result.space, plain(result)
         fixed = {p.name: space.fixed.get(p.name, p.default) for p in space.parameters
@@ -94,7 +98,8 @@ class Description:
             errors=result.errors, correlations=result.correlations,
             file_options=FileOptions({name: decided.get(name, value) if name in DECIDED else value
                                       for name, value in (options or {}).items()}),
-            warnings=result.warnings, confirmation=result.confirmation, **{key: values[key] for key in HOW})
+            warnings=result.warnings, confirmation=result.confirmation, passport=passport,
+            **{key: values[key] for key in HOW})
 
     @property
     def values(self) -> dict[str, float]:
@@ -112,9 +117,9 @@ class Description:
 
 
 def description_document(result: CalibrationResult | Description,
-                         options: Mapping[str, Any] | None = None) -> bytes:
+                         options: Mapping[str, Any] | None = None, passport: Passport = UNKNOWN) -> bytes:
     """Return the definition of a DLO as an XML document in UTF-8."""
-    dlo = result if isinstance(result, Description) else Description.of(result, options)
+    dlo = result if isinstance(result, Description) else Description.of(result, options, passport)
     space = dlo.space
     root = xml.new_root('dlo', version=1, mass=dlo.mass, length=dlo.length)
     xml.add_points(xml.add(root, 'chain'), dlo.chain)
@@ -140,17 +145,22 @@ def description_document(result: CalibrationResult | Description,
     warnings = xml.add(calibration, 'warnings')
     for text in dlo.warnings:
         xml.add(warnings, 'warning', text=text)
+    if dlo.passport != UNKNOWN:
+        words = {name: value for name, value in vars(dlo.passport).items() if name != 'sessions'}
+        element = xml.add(calibration, 'passport', **words)
+        for name, sha256 in dlo.passport.sessions.items():
+            xml.add(element, 'session', name=name, sha256=sha256)
     return xml.document(root)
 
 
 def write_result(path: str | Path, result: CalibrationResult | Description,
-                 options: Mapping[str, Any] | None = None) -> None:
+                 options: Mapping[str, Any] | None = None, passport: Passport = UNKNOWN) -> None:
     """
     Write a result, and the options of its calibration, to an XML file.
 
     :raises InputError: where the file cannot be written.
     """
-    write_file(path, description_document(result, options))
+    write_file(path, description_document(result, options, passport))
 
 
 def write_evaluations(path: Path, result: CalibrationResult) -> None:
@@ -187,17 +197,21 @@ def read_description(octets: bytes | str, where: str = 'dlo_description',
         octets = octets.encode('utf-8', 'surrogatepass')
     root = xml.parse(octets, where, 'dlo')
     chain, parameters, calibration = root
-    fit, *second, options, warnings = calibration
+    fit, *second = calibration.findall('fit') + calibration.findall('confirmation')
+    options, warnings = calibration.find('options'), calibration.find('warnings')
+    passport = _passport(where, calibration)
     given = xml.read_options(where, options, folder)
     if unusable := calibration.get('unusable'):
         given = replace(given, warnings=(f'do not use this result: {unusable}', *given.warnings))
+    if passport.warning:
+        given = replace(given, warnings=(passport.warning, *given.warnings))
     with xml.located(where, parameters):
         dlo = Description(
             **xml.attributes(where, root, Description), **xml.attributes(where, calibration, Description),
             **_fit(where, fit, Description), parameters=_estimates(where, parameters),
             fixed=_fixed(where, parameters), correlations=_correlations(where, parameters),
             chain=xml.read_chain(where, chain), trials=tuple(trial.get('name') for trial in fit),
-            file_options=given,
+            file_options=given, passport=passport,
             warnings=tuple(warning.get('text') for warning in warnings),
             confirmation=Confirmation(**_fit(where, second[0], Confirmation)) if second else None)
         space = dlo.space
@@ -207,6 +221,14 @@ def read_description(octets: bytes | str, where: str = 'dlo_description',
     for element in parameters.findall('fixed'):
         _check_physical(where, element, space)
     return dlo
+
+
+def _passport(where: str, calibration: Any) -> Passport:
+    element = calibration.find('passport')
+    if element is None:
+        return UNKNOWN
+    return replace(Passport(**xml.attributes(where, element, Passport)), sessions={
+        session.get('name'): session.get('sha256') for session in element})
 
 
 def _add_fit(calibration: Any, tag: str, fit: Description | Confirmation, trials: Sequence[str]) -> None:

@@ -130,7 +130,24 @@ def session_trials(session: Session, options: Options, note: Callable[[str], obj
     for text in counted(early):
         note(text)
     named = (replace(trial, name=f'trial {k}') for k, trial in enumerate(trials, start=1))
-    return tuple(named), counted(refusals)
+    return _in_sessions(tuple(named), options), counted(refusals)
+
+
+def _in_sessions(trials: tuple[Trial, ...], options: Options) -> tuple[Trial, ...]:
+    """
+    Return trials with the numbers of their sessions.
+
+    :raises InputError: if there are other trials than the options say.
+    """
+    counts = options.trials_of_sessions
+    if not counts or not trials:
+        return trials
+    if sum(counts) != len(trials):
+        raise InputError('parameter sessions', f'{options.sessions}, which are {sum(counts)} trials',
+                         f'numbers that add up to {len(trials)}, the trials that there are', 'correct it')
+    sessions = [session for session, count in enumerate(counts, start=1) for _ in range(count)]
+    return tuple(replace(trial, session=session)
+                 for trial, session in zip(trials, sessions, strict=True))
 
 
 def session_manipulations(session: Session,

@@ -30,6 +30,7 @@ from dlo_calibration.evaluation.linearisation import (
     WIDEST,
 )
 from dlo_calibration.evaluation.pool import Pool
+from dlo_calibration.inference.together import CORRELATED
 from dlo_calibration.inference.uncertainty import DEVIATIONS, IDENTIFIABLE_WIDTH, Uncertainty
 from dlo_calibration.model.action import Action
 from dlo_calibration.model.chain import Chain, Floats
@@ -80,8 +81,9 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, pool: Pool, point: Fl
     Return the action that reduces the largest standard deviation most.
 
     The parameters are tried from the least certain one on, until an action helps, the others are
-    identifiable, or actions were simulated for `MOST_SOUGHT` of them.  To save rollouts, only this parameter
-    is varied at first; the others are varied for the three best actions alone.
+    identifiable, or actions were simulated for `MOST_SOUGHT` of them.  To save rollouts, only this parameter,
+    and what is known only together with it, is varied at first; the others are varied for the three best
+    actions alone.
 
     :param point: (d,) the found values in the unit cube.
     :param uncertainty: of the parameters now.
@@ -91,6 +93,8 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, pool: Pool, point: Fl
     """
     if uncertainty.covariance is None:
         return None
+    assert uncertainty.correlations is not None
+    correlations = uncertainty.correlations
     possible, present = list(candidates(trials)), np.linalg.inv(uncertainty.covariance)
 
     def derivatives(actions: Sequence[Candidate], varied: NDArray[np.bool_]
@@ -103,10 +107,15 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, pool: Pool, point: Fl
         now = float(uncertainty.std[k])
         if 2 * DEVIATIONS * now <= IDENTIFIABLE_WIDTH or len(sought) == MOST_SOUGHT:
             return None
-        alone = np.arange(space.dimension) == k
+        # What is known only together with another parameter becomes certain by what shows either.
+        alone = np.abs(correlations[k]) >= CORRELATED
+        alone[k] = True
+        own = int(np.flatnonzero(alone).tolist().index(k))
+        deviations = uncertainty.std[alone]
+        before = np.linalg.inv(correlations[np.ix_(alone, alone)] * np.outer(deviations, deviations))
         promising: list[tuple[float, Candidate, Floats]] = []
-        showing = [candidate for candidate in possible
-                   if excites([candidate.trial], space, np.inf)[0, k]]  # inf: a table may have any height
+        showing = [candidate for candidate in possible  # inf: a table may have any height
+                   if excites([candidate.trial], space, np.inf)[0, alone].any()]
         if showing:
             sought.add(k)
         for candidate, column in zip(showing, derivatives(showing, alone), strict=True):
@@ -114,7 +123,8 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, pool: Pool, point: Fl
                 possible.remove(candidate)
                 continue
             # An upper bound of the gain: the other parameters count as known.
-            at_best = float((now**-2 + information(column, uncertainty.scale)[k, k])**-0.5)
+            gained = information(column, uncertainty.scale)[np.ix_(alone, alone)]
+            at_best = float(standard_deviations(before + gained)[own])
             if at_best < WORTH_IT * now:
                 promising.append((at_best, candidate, column))
         best: tuple[float, Candidate] | None = None

@@ -69,6 +69,7 @@ class Uncertainty:
     :param excited: (d,) False for a parameter that has no effect on any trial.
     :param at_bound: (d,) True if the best value is at an end of the scale.
     :param covariance: (d, d); None if only the spread of the evaluations is known.
+    :param local: (d, d) covariance before intervals were widened to where the linear model no longer holds.
     :param residual: standard deviation of one coordinate's residual [m]; nan if it was not estimated.
     :param scale: the same, enlarged because neighbouring residuals are correlated [m].
     """
@@ -81,6 +82,7 @@ class Uncertainty:
     covariance: Floats | None = None
     residual: float = float('nan')
     scale: float = float('nan')
+    local: Floats | None = None
 
     @property
     def verdicts(self) -> tuple[str, ...]:
@@ -222,8 +224,11 @@ def at_minimum(fit: Linearisation, layout: ResidualLayout, *, noise: float = flo
             extra = np.maximum.reduce([
                 (count - 1) * np.mean(without**2 - by_chance, axis=0),
                 np.mean(drawn**2 - drawn_by_chance, axis=0), extra])
+    # Trials that disagree move the optimum most in the directions that are known least.
+    certain = np.sqrt(np.diag(covariance))
+    moved = covariance / np.outer(certain, certain) * np.sqrt(np.outer(extra, extra))
     if shift is not None:
-        extra = extra + (2 * shift)**2  # twice as fine halves the error, which is of first order
+        moved = moved + np.outer(2 * shift, 2 * shift)  # twice as fine halves the error, of first order
     if len(starts):  # the noise of each trial's own initial chain moves the optimum by a Gauss-Newton step
         changes = np.array(starts) - fit.residuals
         # The residuals contain one such change: larger ones come from too high a noise level, or from chaos.
@@ -240,7 +245,7 @@ def at_minimum(fit: Linearisation, layout: ResidualLayout, *, noise: float = flo
         pull = fit.jacobian.T @ (loss.roots(fit.residuals)**2 * (residuals - fit.residuals)) / scale**2
         move = np.linalg.solve(weighted.information + prior, pull)
         covariance = covariance + np.where(np.outer(excited, excited), np.outer(move, move), 0.0)
-    covariance = covariance + np.diag(np.where(excited, extra, 0.0))
+    covariance = covariance + np.where(np.outer(excited, excited), moved, 0.0)
     # No standard deviation is larger than that of the prior.
     shrink = np.minimum(1.0, UNKNOWN_STD / np.sqrt(np.diag(covariance)))
     covariance = covariance * np.outer(shrink, shrink)
@@ -248,7 +253,8 @@ def at_minimum(fit: Linearisation, layout: ResidualLayout, *, noise: float = flo
     lower = np.where(excited, np.maximum(point - DEVIATIONS * std, 0.0), 0.0)
     upper = np.where(excited, np.minimum(point + DEVIATIONS * std, 1.0), 1.0)
     uncertainty = Uncertainty(frozen_array(std), frozen_array(lower), frozen_array(upper), excited,
-                              excited & at_end(point), frozen_array(covariance), residual, scale)
+                              excited & at_end(point), frozen_array(covariance), residual, scale,
+                              frozen_array(covariance))
     return uncertainty.within(np.clip(np.minimum(lower, point + without.min(axis=0)), 0.0, 1.0),
                               np.clip(np.maximum(upper, point + without.max(axis=0)), 0.0, 1.0))
 

@@ -12,6 +12,7 @@ from itertools import combinations
 from pathlib import Path
 import platform
 import shlex
+from types import MappingProxyType
 from typing import Any, Mapping, Sequence, TYPE_CHECKING
 
 from dlo_calibration.calibration.engines import obstacles_of
@@ -35,6 +36,8 @@ from dlo_calibration.simulation.scene import Obstacle
 
 if TYPE_CHECKING:
     from jinja2 import Template
+
+    from dlo_calibration.report.figure import Panel
 
 MOST_TRIALS = 12  # are drawn, so that the page stays small
 MOST_CORRELATIONS = 12  # parameters of a table of all; of more, as many pairs are listed
@@ -66,16 +69,18 @@ def repeating_command(session: str, options: Options, selection: Sequence[str] =
                        *(word for name, value in changed.items() for word in as_flags(name, value))])
 
 
-def page_of(result: CalibrationResult, origin: Origin, slices: Slices | None = None) -> str:
+def page_of(result: CalibrationResult, origin: Origin, slices: Slices | None = None,
+            films: Mapping[int, Panel] = MappingProxyType({})) -> str:
     """
     Return the page, which needs no other file and no network.
 
     :param slices: through the best parameter set; None: the page has none.
+    :param films: of trials, by index; see `before_after`.
     :raises InputError: if the scene can no longer be read.
     """
     values = plain(result)
     return _template().render(
-        values=values, result=result, origin=origin, slices=slices, sentences=sentences(result),
+        values=values, result=result, origin=origin, slices=slices, films=films, sentences=sentences(result),
         rows=parameter_rows(values['parameters'], result.space),
         correlated=most_correlated(values['correlations']),
         marks={IDENTIFIABLE: 'good', WEAK: 'weak', NOT_IDENTIFIABLE: 'bad', '': ''},  # classes of the style
@@ -127,13 +132,19 @@ def _errors(result: CalibrationResult, values: Mapping[str, Any]) -> dict[str, f
             None if result.band is None else float(result.band.mean())}
 
 
+def drawn_trials(result: CalibrationResult) -> list[int]:
+    """Return the indices of the trials that the page draws: those with the largest errors."""
+    errors = [PointErrors.of(residuals(trial, chains)).mean
+              for trial, chains in zip(result.trials, result.chains, strict=True)]
+    return sorted(sorted(range(len(errors)), key=lambda k: -errors[k])[:MOST_TRIALS])
+
+
 def _trials(result: CalibrationResult, obstacles: Sequence[Obstacle]) -> dict[str, Any]:
     """Return a table row for each trial, and by index the drawings of those with the largest errors."""
     errors = [PointErrors.of(residuals(trial, chains))
               for trial, chains in zip(result.trials, result.chains, strict=True)]
-    worst = sorted(range(len(errors)), key=lambda k: -errors[k].mean)[:MOST_TRIALS]
     return {'trials': list(zip(result.trials, result.best.scores, errors, strict=True)),
-            'drawn': {k: trial_panels(Drawn.of(result, k, obstacles)) for k in sorted(worst)}}
+            'drawn': {k: trial_panels(Drawn.of(result, k, obstacles)) for k in drawn_trials(result)}}
 
 
 def _changed(options: Options) -> dict[str, Any]:

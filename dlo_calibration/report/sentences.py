@@ -41,8 +41,8 @@ MOST_COMBINATIONS = 3  # of parameters that the trials do not determine, in sent
 def sentences(result: CalibrationResult) -> list[str]:
     """Return sentences on the parameters and their uncertainty, the next action, and how well the fit is."""
     return [*_parameters(result), *rest_shape_sentences(result), *friction_sentences(result),
-            *_advice(result), *_uninformative(result), *_fit(result), *_missing_parameters(result),
-            *_undetermined(result)]
+            *(pair.words for pair in result.together), *_advice(result), *_uninformative(result),
+            *_fit(result), *_missing_parameters(result), *_undetermined(result)]
 
 
 def _parameters(result: CalibrationResult) -> list[str]:
@@ -93,7 +93,10 @@ def _advice(result: CalibrationResult) -> list[str]:
     advice = result.advice
     if advice is None:
         return []
-    return [f'To know {advice.parameter} better, {advice.words} (action {advice.action}). On the scale from '
+    partners = [name for pair in result.together for name in (pair.first, pair.second)
+                if advice.parameter in (pair.first, pair.second) and name != advice.parameter]
+    aim = f'tell {advice.parameter} from {partners[0]}' if partners else f'know {advice.parameter} better'
+    return [f'To {aim}, {advice.words} (action {advice.action}). On the scale from '
             f'0 to 100, that should bring its standard deviation from {number(advice.std * SCALE)} to '
             f'{number(advice.expected_std * SCALE)}.']
 

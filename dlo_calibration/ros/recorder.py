@@ -13,6 +13,7 @@ from typing import Callable, Mapping, Sequence
 
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.passport import Passport
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.errors import InputError
 from dlo_calibration.evaluation.log import EvaluationLog
@@ -132,7 +133,7 @@ class Recorder:
                 if older:
                     (folder / name).replace(folder / _numbered(name, older))
         attempts = Attempts(folder)
-        write_values(attempts, result, options)
+        write_values(attempts, result, options, Passport.new(options.measured_by))
         self._written = not attempts.failure
         if attempts.failure:
             self._miss(folder, attempts.failure)

@@ -18,6 +18,7 @@ from typing import Any, Callable, Iterator, Mapping
 from dlo_calibration.calibration.choice import choose
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.passport import Passport
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.errors import InputError, safe_line
 from dlo_calibration.evaluation.evaluation import Evaluation
@@ -190,7 +191,8 @@ class Outlet:
         """Send a result, and the description of the DLO that it gives."""
         self.send('result', diagnostics.result(self._types, result, self._graph.stamp()))
         self.send('dlo_description', self._types.build(
-            OUTPUT_TYPES['dlo_description'], data=description_document(result, options.flat()).decode()))
+            OUTPUT_TYPES['dlo_description'], data=description_document(
+                result, options.flat(), Passport.new(options.measured_by)).decode()))
 
     def markers(self, state: SessionState, collector: TrialCollector, at_once: bool) -> None:
         """Send the markers of all trials, unless the last ones show the same."""

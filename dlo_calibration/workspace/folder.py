@@ -17,6 +17,7 @@ import numpy as np
 from dlo_calibration.calibration.choice import choose
 from dlo_calibration.calibration.engines import engine_digest, SimulatorFactory
 from dlo_calibration.calibration.options import MACHINE, names_of, Options, recordable
+from dlo_calibration.calibration.passport import Passport
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.errors import InputError, unwritable
 from dlo_calibration.evaluation.digest import digest, file_digests
@@ -190,7 +191,11 @@ class CalibrationFolder:
 
         assert self._source is not None
         source, attempts = self._source, Attempts(self.path)
-        write_values(attempts, result, source.options)
+        parts = source.parts or (source,)
+        stamps = [record.log_time * 1e-9 for part in parts for record in part.session.inputs]
+        files = [file for part in parts for file in _recorded(part.path)]
+        write_values(attempts, result, source.options, Passport.new(
+            source.options.measured_by, min(stamps, default=0.0), file_digests(files)))
         with attempts.attempt(SESSION):
             _write_session(source, self.path / SESSION)
         if source.request is not None:
@@ -249,10 +254,11 @@ def session_log(folder: Path, trials: Sequence[Trial], options: Options) -> Eval
     return EvaluationLog(folder / name)
 
 
-def write_values(attempts: Attempts, result: CalibrationResult, options: Options) -> None:
+def write_values(attempts: Attempts, result: CalibrationResult, options: Options, passport: Passport
+                 ) -> None:
     """Write the result and the table of its evaluations into the folder of `attempts`."""
     with attempts.attempt(RESULT):
-        write_result(attempts.folder / RESULT, result, options.flat())
+        write_result(attempts.folder / RESULT, result, options.flat(), passport)
     with attempts.attempt(EVALUATIONS):
         write_evaluations(attempts.folder / EVALUATIONS, result)
 

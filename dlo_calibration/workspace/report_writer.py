@@ -18,7 +18,9 @@ from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.calibration.stages import sliced
 from dlo_calibration.errors import DloCalibrationError
-from dlo_calibration.report.page import Origin, page_of
+from dlo_calibration.report.before_after import films
+from dlo_calibration.report.figure import Panel
+from dlo_calibration.report.page import drawn_trials, Origin, page_of
 from dlo_calibration.writing import reason, write_file
 
 PATIENCE = 10.0  # s; whoever ends the node does not wait longer
@@ -40,10 +42,20 @@ def write_report(path: Path, result: CalibrationResult, origin: Origin, make_sim
         with executor:
             executor.submit(import_module, 'matplotlib.figure')  # loading it takes as long as the slices
             slices = sliced(result, origin.options, make_simulator, should_stop)
-            page = executor.submit(page_of, result, origin, slices).result()
+            page = executor.submit(page_of, result, origin, slices, _films(
+                result, origin, make_simulator, should_stop)).result()
     except BrokenExecutor as error:
         raise DloCalibrationError('the process that draws it was ended from outside') from error
     write_file(path, page)
+
+
+def _films(result: CalibrationResult, origin: Origin, make_simulator: SimulatorFactory,
+           should_stop: Callable[[], bool]) -> dict[int, Panel]:
+    """Return the films of the trials that the page draws; none if the engine fails."""
+    try:
+        return films(result, drawn_trials(result), origin.options, make_simulator, should_stop)
+    except Exception:  # the page is written even if the engine fails
+        return {}
 
 
 class ReportWriter:

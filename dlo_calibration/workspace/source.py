@@ -9,8 +9,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Callable, Mapping, Sequence
 
-import numpy as np
-
 from dlo_calibration.calibration.choice import hand_warnings
 from dlo_calibration.calibration.options import FileOptions, names_of, OBSERVATION, Options
 from dlo_calibration.errors import DloCalibrationError, InputError
@@ -59,6 +57,7 @@ class Source:
     :param numbers: of the trials, from 1; trials that the user leaves out count, too.
     :param implausible: why the trials cannot be as described, see `plausibility`.
     :param evidence: of the hands in the trials.
+    :param parts: several sessions of one DLO, of which this is made; empty: it is one.
     """
 
     selection: Selection
@@ -73,6 +72,7 @@ class Source:
     numbers: tuple[int, ...] = ()
     implausible: tuple[str, ...] = ()
     evidence: GripEvidence = GripEvidence(None, None, ())
+    parts: tuple[Source, ...] = ()
 
     @property
     def trial_warnings(self) -> tuple[str, ...]:
@@ -141,29 +141,13 @@ def _with_trials(source: Source, warn: Callable[[str], None]) -> Source:
     for text in (*source.warnings, *notes, *(refusals if trials or source.request is None else ())):
         warn(text)  # if no trial of a request can be used, `require_trials` says why
     numbers = _numbers(without, [trial.name for trial in trials], warn)
-    used = tuple(_in_sessions(trials, options)[number - 1] for number in numbers)
+    used = tuple(trials[number - 1] for number in numbers)
     implausible = implausible_trials(used, options.table_top, bool(options.scene))
     source = replace(source, trials=used, refusals=refusals, notes=tuple(notes), numbers=numbers,
                      implausible=implausible, evidence=GripEvidence.of(used))
     for text in source.trial_warnings:
         warn(text)
     return source
-
-
-def _in_sessions(trials: Sequence[Trial], options: Options) -> Sequence[Trial]:
-    """
-    Return trials with the numbers of their sessions.
-
-    :raises InputError: if there are other trials than the options say.
-    """
-    counts = options.trials_of_sessions
-    if not counts or not trials:
-        return trials
-    if sum(counts) != len(trials):
-        raise InputError('parameter sessions', f'{options.sessions}, which are {sum(counts)} trials',
-                         f'numbers that add up to {len(trials)}, the trials that there are', 'correct it')
-    sessions = np.repeat(np.arange(1, len(counts) + 1), counts).tolist()
-    return [replace(trial, session=session) for trial, session in zip(trials, sessions, strict=True)]
 
 
 def read_sources(selections: Sequence[Selection], warn: Callable[[str], None]) -> Source:
@@ -185,7 +169,8 @@ def read_sources(selections: Sequence[Selection], warn: Callable[[str], None]) -
     options = {**first.options.flat(), 'sessions': ' '.join(str(len(source.trials)) for source in sources)}
     path = first.path.with_name('+'.join(source.path.name for source in sources))
     session = Session(path, records, records, FileOptions(options))
-    merged = Source(replace(selections[0], path=path), session, None, Options.of(options), (), None)
+    merged = Source(replace(selections[0], path=path), session, None, Options.of(options), (), None,
+                    parts=tuple(sources))
     return _with_trials(merged, warn)
 
 

@@ -61,7 +61,8 @@ def test_result_is_drawn_too(run, session, result, tmp_path):
     code, output, _ = run('plot', session, result, '--output', tmp_path / 'both', '--json')
     assert code == 0
     assert json.loads(output) == {
-        'pictures': [str(tmp_path / 'both' / f'trial_{k}.png') for k in (1, 2)], 'animations': []}
+        'pictures': [str(tmp_path / 'both' / f'trial_{k}.png') for k in (1, 2)],
+        'films': [str(tmp_path / 'both' / f'trial_{k}.svg') for k in (1, 2)], 'animations': []}
     measured, both = (np.asarray(Image.open(tmp_path / name / 'trial_1.png').convert('RGB')).astype(int)
                       for name in ('measured', 'both'))
 
@@ -77,7 +78,8 @@ def test_animation_is_a_gif_per_trial(run, session, result, tmp_path, monkeypatc
     monkeypatch.setattr('dlo_calibration.report.animation.DOTS_PER_INCH', 40)
     code, output, _ = run('plot', session, result, '--animation', '--output', tmp_path / 'films', '--json')
     assert code == 0
-    assert written(tmp_path / 'films') == ['trial_1.gif', 'trial_1.png', 'trial_2.gif', 'trial_2.png']
+    assert written(tmp_path / 'films') == [
+        'trial_1.gif', 'trial_1.png', 'trial_1.svg', 'trial_2.gif', 'trial_2.png', 'trial_2.svg']
     for path in json.loads(output)['animations']:
         assert Image.open(path).n_frames > 2
 

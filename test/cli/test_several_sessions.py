@@ -15,7 +15,7 @@ from dlo_calibration import Action, calibrate, Chain, Goal, Hand, Options, Trial
 from dlo_calibration.cli import main as cli
 from dlo_calibration.files.recording import write_records
 from dlo_calibration.files.result import read_result
-from dlo_calibration.files.session import trial_records
+from dlo_calibration.files.session import read_session, trial_records
 from dlo_calibration.model.parameters import BY_NAME, ParameterSpace
 from dlo_calibration.simulation.compiled import CompiledSimulator
 
@@ -68,6 +68,8 @@ def test_the_files_of_the_result_give_it_again(fit, sessions, tmp_path):
     again = fit(tmp_path / 'out' / 'session.mcap', '--without', 2)[1]
     assert again['parameters'] == printed['parameters']
     assert set(read_result(tmp_path / 'out' / 'result.xml').parameters) >= {'friction', 'friction_session_3'}
+    merged = read_session(tmp_path / 'out' / 'session.mcap')
+    assert [trial.session for trial in merged.trials] == [1, 1, 2, 2, 3, 3]
     assert cli.main(['validate', str(tmp_path / 'out' / 'result.xml'), str(sessions[0])], new_toy) == 0
 
 

@@ -24,6 +24,7 @@ import cv2
 import numpy as np
 import pytest
 
+from dlo_calibration.files.session import samples
 from dlo_calibration.model.parameters import interval
 from dlo_calibration.page import information
 from dlo_calibration.simulation.compiled import CompiledSimulator
@@ -489,3 +490,20 @@ def test_a_missing_camera_gives_a_sentence(opened, empty):
     assert tab.violations() == []
     tab.keys('Escape')
     assert not tab.find('dialog').is_visible()
+
+
+def test_trials_are_compared_with_an_earlier_result(opened, empty, tmp_path):
+    whole_trial(empty)
+    tab = opened()
+    tab.step('Calibrate')
+    panel = tab.find('details:has-text("Still the same DLO?")')
+    panel.locator('summary').click()
+    chooser = panel.locator('input[type=file]')
+    chooser.set_input_files(samples() / 'xml' / 'dlo.xml')
+    verdict = panel.locator('strong.verdict')
+    seen(lambda: verdict.count() and verdict.inner_text() in ('agrees', 'changed', 'cannot tell'))
+    assert panel.locator('p').count() > 1
+    assert tab.violations() == []
+    (tmp_path / 'no.xml').write_text('<dlo/>')
+    chooser.set_input_files(tmp_path / 'no.xml')
+    seen(lambda: 'no.xml' in panel.inner_text())

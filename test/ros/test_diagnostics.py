@@ -12,6 +12,7 @@ from wire import result_values, wire
 
 from dlo_calibration.calibration.result import CalibrationResult, ParameterEstimate
 from dlo_calibration.evaluation.evaluation import Evaluation
+from dlo_calibration.inference.together import Together
 from dlo_calibration.inference.trial_information import TrialInformation
 from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain
@@ -71,6 +72,7 @@ def test_result_has_the_values_of_the_whole_calibration(types):
         'score': '30.375', 'trials': '2', 'evaluations': '3', 'simulations': '6', 'engine': 'bullet',
         'search': 'random', 'seed': '7', 'stop_reason': 'budget of 3 evaluations spent', 'choice': '',
         'headline': sample_result().headline, 'unusable': '', 'warnings': 'one; two', 'undetermined': '',
+        'together': '',
         'cross_validated_error_mm': '', 'default_error_mm': '',
         'noise_mm': '', 'residual_std_mm': ''}
     assert status.level == types.level(1)
@@ -84,6 +86,15 @@ def test_result_has_the_values_of_the_whole_calibration(types):
     assert status.level == types.level(1)
     assert status.message.startswith('Not usable: trial 1: a DLO in the air. The simulated')
     assert values['unusable'] == 'trial 1: a DLO in the air'
+
+
+def test_what_only_two_parameters_together_tell_is_one_text(types, monkeypatch):
+    pair = Together('flexibility', 'mass', -1.0, 0.04, (0.3, 0.3))
+    monkeypatch.setattr(CalibrationResult, 'together', (pair,))
+    _, values = by_name(diagnostics.result(types, sample_result(), STAMP))['calibration']
+    assert values['together'] == pair.words == (
+        'flexibility / mass, in physical values, is known to 4 %, each alone only to 30 %.')
+    assert pair.words in values['findings']
 
 
 def test_progress_has_the_best_so_far_and_the_time_left(types):

@@ -15,6 +15,7 @@ def leave_out_drawings(replace=setattr):
     """Let the page of a result have its words only; `replace` sets an attribute of a module."""
     # A thread in place of a process, in which drawings could not be left out.
     replace(report_writer, 'ProcessPoolExecutor', lambda *_: ThreadPoolExecutor(1))
+    replace(report_writer, 'films', lambda *_: {})
     for module in (bending_drawing, figure, landscape):
         replace(module, 'panel', lambda draw, words, legend=True: Panel('data:,', words))
 
