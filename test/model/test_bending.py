@@ -69,10 +69,11 @@ def test_a_free_dlo_takes_this_rest_shape():
         np.testing.assert_allclose(seen, drawn, rtol=0.01)
 
 
+@pytest.mark.parametrize('locking', [0.0, 0.3])
 @pytest.mark.parametrize('reach', [0.1, 0.4, 0.5, 3.0])
-def test_a_cycle_takes_the_energy_of_friction(reach):
+def test_a_cycle_takes_the_energy_of_friction(reach, locking):
     curvatures = cycle(reach)
-    moments = bending_moments(curvatures, STIFFNESS, FRICTION, SLIP)
+    moments = bending_moments(curvatures, STIFFNESS, FRICTION, SLIP, locking)
     area = ((moments[400:-1] + moments[401:]) / 2 * np.diff(curvatures[400:])).sum()
     expected = 4 * STIFFNESS * FRICTION * max(reach - SLIP, 0.0)
     assert area == pytest.approx(expected, rel=0.01, abs=1e-9)
