@@ -424,5 +424,15 @@ def bending_moments(curvatures: Floats, stiffness: float, friction: float, slip:
     stress = np.zeros(len(curvatures))
     for k, change in enumerate(np.diff(curvatures), start=1):
         stress[k] = np.clip(stress[k - 1] + friction / slip * change, -friction, friction)
-    stiffening = np.minimum((locking * curvatures)**2, MOST_LOCKED)
-    return stiffness * ((1 + stiffening) * curvatures + stress)
+    return stiffness * (_elastic(curvatures, locking) + stress)
+
+
+def kept_curvature(friction: float, locking: float = 0.0) -> float:
+    """Return the curvature [1/m] that stays after a DLO was bent far; parameters as of `bending_moments`."""
+    curvatures = np.linspace(0, friction, 1001)
+    return float(np.interp(friction, _elastic(curvatures, locking), curvatures))
+
+
+def _elastic(curvatures: Floats, locking: float) -> Floats:
+    """Return the elastic moments at (m,) curvatures [1/m], relative to EI."""
+    return np.asarray((1 + np.minimum((locking * curvatures)**2, MOST_LOCKED)) * curvatures)

@@ -14,6 +14,7 @@ from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import (
     bending_moments,
     BY_NAME,
+    kept_curvature,
     LOCKING,
     measured,
     natural_curvature,
@@ -62,6 +63,7 @@ def moment_panels(result: CalibrationResult) -> list[Panel]:
         return []
     physical, space = result.physical(), result.space
     friction, slip, locking = (physical[name] for name in ('bending_friction', 'bending_slip', LOCKING))
+    kept = kept_curvature(friction, locking)
     flexibility = result.values.get(
         'flexibility', space.fixed.get('flexibility', BY_NAME['flexibility'].default))
     stiffness, unit = space.reported('flexibility', flexibility)
@@ -85,15 +87,15 @@ def moment_panels(result: CalibrationResult) -> list[Panel]:
         axes.axvline(0, color=FAINT, linewidth=0.6, zorder=0.5)
         axes.plot([slip], [np.interp(slip, first, moments[:FINE + 1])], 's', color=OBSERVED, markersize=6,
                   label=f'bending_slip: from {measured(slip, "1/m")} on, the strands slip')
-        axes.plot([friction], [0], 'o', color=OBSERVED, markersize=7,
-                  label=f'bending_friction: {measured(friction, "1/m")} stay when it is released')
+        axes.plot([kept], [0], 'o', color=OBSERVED, markersize=7,
+                  label=f'bending_friction: {measured(kept, "1/m")} stay when it is released')
         axes.set(title=f'moment that bends {"part 1" if space.parts > 1 else "it"} to and fro',
                  xlabel='curvature, from that of the rest shape [1/m]', ylabel=f'moment [{unit}]')
         axes.grid(alpha=0.3)
 
     return [panel(draw, (
         f'The moment, up to {number(moments.max())} {unit}, while a piece of the DLO is bent to and fro: '
-        f'{measured(friction, "1/m")} of curvature stay when it is released; the strands slip after '
+        f'{measured(kept, "1/m")} of curvature stay when it is released; the strands slip after '
         f'{measured(slip, "1/m")}'))]
 
 

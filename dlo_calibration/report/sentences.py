@@ -20,6 +20,7 @@ from dlo_calibration.model.chain import Chain, Floats, grip_place
 from dlo_calibration.model.parameters import (
     BY_NAME,
     interval,
+    kept_curvature,
     knot_names,
     LOCKING,
     measured,
@@ -270,8 +271,8 @@ def friction_sentences(result: CalibrationResult) -> list[str]:
     stiffer = '' if not physical[LOCKING] or _verdict(result, LOCKING) == NOT_IDENTIFIABLE else (
         f' Bent to a radius of {measured(physical[LOCKING], "m")}, it is twice as stiff.')
     return [f'Bent far and released, the DLO {"may keep" if unsure else "keeps"} a curvature of up to '
-            f'{_with_radius(physical["bending_friction"])}, because its strands rub on each other{slips}.'
-            + stiffer]
+            f'{_with_radius(kept_curvature(physical["bending_friction"], physical[LOCKING]))}, because its '
+            f'strands rub on each other{slips}.{stiffer}']
 
 
 def keeps_bends(result: CalibrationResult) -> bool:

@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 from stepping import SteppedRope
 
-from dlo_calibration.model.parameters import bending_moments, natural_curvature, ParameterSpace, rest_shape
+from dlo_calibration.model.parameters import (
+    bending_moments,
+    kept_curvature,
+    natural_curvature,
+    ParameterSpace,
+    rest_shape,
+)
 
 STIFFNESS, FRICTION, SLIP = 2e-3, 1.5, 0.4
 
@@ -86,8 +92,11 @@ def test_a_branch_of_hysteresis_is_the_first_loading_twice_as_large():
     np.testing.assert_allclose(moments[100] - moments[100:301:2], 2 * first, atol=1e-12)
 
 
-def test_a_dlo_that_was_bent_far_keeps_the_curvature_of_friction():
+@pytest.mark.parametrize('locking', [0.0, 1.0, 10.0])
+def test_a_dlo_that_was_bent_far_keeps_the_curvature_of_friction(locking):
     curvatures = cycle(5.0, 1000)
     unloading = slice(1000, 3001)
-    moments = bending_moments(curvatures, STIFFNESS, FRICTION, SLIP)[unloading]
-    assert np.interp(0.0, -moments, -curvatures[unloading]) == pytest.approx(-FRICTION, abs=5e-3)
+    moments = bending_moments(curvatures, STIFFNESS, FRICTION, SLIP, locking)[unloading]
+    kept = np.interp(0.0, -moments, -curvatures[unloading])
+    assert kept == pytest.approx(-kept_curvature(FRICTION, locking), abs=5e-3)
+    assert kept_curvature(FRICTION) == pytest.approx(FRICTION)
