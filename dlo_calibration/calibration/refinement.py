@@ -25,7 +25,12 @@ from dlo_calibration.errors import SimulationError
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.evaluation.linearisation import Differences, Linearisation, WIDEST
 from dlo_calibration.evaluation.residuals import Huber, ResidualLayout
-from dlo_calibration.inference.cross_validation import left_out_errors, predicts_better
+from dlo_calibration.inference.cross_validation import (
+    LEAST_GAIN,
+    left_out_errors,
+    log_gains,
+    predicts_better,
+)
 from dlo_calibration.inference.uncertainty import noise_alone
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import BY_NAME, KNOTS, MOST_PARTS, ParameterSpace, SCALE
@@ -101,14 +106,15 @@ class _Ladder:
 
     def climb(self, rungs: Iterable[tuple[int, Finer]]) -> str:
         """
-        Try rungs, each from the previous one, until two of them are no improvement.
+        Try rungs, each from the previous one, until two of them predict no better than the best.
 
-        A single one may mislead: two parts do not show that a DLO is stiff in the middle, four do.
+        A single one may mislead: two parts do not show that a DLO is stiff in the middle, four do. One that
+        predicts better, but not significantly, is not kept; nor does it count as a failure.
 
         :param rungs: the number of knots or parts of each, and how to refine a space.
         :returns: why it ended, in words; empty if there is no finer rung.
         """
-        why, latest, missed = '', self.best, False
+        why, latest, missed = '', self.best, 0
         for count, finer in rungs:
             if _explained(self._setting.trials, self.best):
                 break
@@ -122,18 +128,19 @@ class _Ladder:
                 return f': stopped before {count} were fitted'
             except SimulationError:  # the fit of the coarser space remains valid
                 return f': {count} could not be simulated'
-            latest = stage or latest
+            latest, promising = stage or latest, False
             if stage is not None and errors is not None:
                 if self._best_errors is None:
                     self._best_errors = self._fold_errors(self.best)
                 if predicts_better(errors, self._best_errors):
                     self.best, self._best_errors, why = stage, errors, ''
                     continue
+                promising = log_gains(errors, self._best_errors).mean() > LEAST_GAIN
             why = f': {count} would explain too little' if stage is None else \
                 f': {count} would not predict left-out trials better'
-            if missed:
+            missed += not promising
+            if missed == 2:
                 break
-            missed = True
         return why
 
     def outcome(self, words: str) -> Fit:
