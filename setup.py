@@ -134,6 +134,7 @@ setup(
         'console_scripts': [
             f'calibrator = {NAME}.ros.executable:calibrator',
             f'planner = {NAME}.ros.executable:planner',
+            f'tracker = {NAME}.ros.executable:tracker',
             f'dlo-calibration = {NAME}.__main__:main',
         ],
     },

@@ -12,7 +12,7 @@ no file outside its own folder.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 import re
 from types import MappingProxyType
@@ -24,9 +24,12 @@ from dlo_calibration.model.parameters import (
     HANDS,
     measured,
     MOST_PARTS,
+    MOST_SESSIONS,
+    own_name,
     PAPER_PARAMETERS,
     PARAMETERS,
     ParameterSpace,
+    PART_NAMES,
     REST_SHAPE,
     SCALE,
 )
@@ -214,6 +217,14 @@ class Options(DeclaredOptions):
         'internal_damping if goals were seen in motion; torsion, bending_friction and bending_slip if that '
         'was between two clamps',
         choices=(AUTO, *BY_NAME), of=SEARCH)
+    own: tuple[str, ...] = declared(
+        (), 'names of the parameters that differ from session to session, if several sessions of one DLO are '
+        'calibrated together, e.g. friction on another table, or mass with another load; each session gets a '
+        'value of its own',
+        choices=tuple(name for name in BY_NAME if name not in (*PART_NAMES, *REST_SHAPE)), of=SEARCH)
+    sessions: str = declared(
+        '', 'numbers of trials of each of several sessions of one DLO, in their order, e.g. 4 3; fit with '
+        'several sessions sets it; empty: all trials are of one session', of=OBSERVATION)
     parts: int = declared(
         0, 'number of parts of equal length, each with its own bending stiffness; 0: chosen by '
         'cross-validation, like the rest shape of a DLO in clamps that resists twist (search least_squares; '
@@ -274,6 +285,11 @@ class Options(DeclaredOptions):
             self, 'values', {name: given.get(name, d.default) for name, d in FIXED_VALUES.items()})
         if self.frame_pose and self.table_frame is None:
             Pose.of(self.frame_pose)  # refuses what is neither
+        if not re.fullmatch('([1-9][0-9]{0,5}( [1-9][0-9]{0,5})*)?', self.sessions) or \
+                len(self.trials_of_sessions) > MOST_SESSIONS:
+            raise InputError('parameter sessions', repr(self.sessions[:40]),
+                             f'the numbers of trials of at most {MOST_SESSIONS} sessions, e.g. 4 3',
+                             'correct it')
         if AUTO in self.calibrate and self.calibrate != (AUTO,):
             raise InputError('parameter calibrate', ', '.join(self.calibrate), 'auto alone, or only names',
                              'leave auto out, and name every parameter to find')
@@ -334,8 +350,16 @@ class Options(DeclaredOptions):
         bent = {name: value for name, value in self.values.items()
                 if name in REST_SHAPE and value != BY_NAME[name].default}
         hands = {name: BY_NAME[name].value(getattr(self, name)) for name in HANDS if getattr(self, name)}
-        return ParameterSpace(self._names, {**self.values, **hands}, self.mass).divided(
+        space = ParameterSpace(self._names, {**self.values, **hands}, self.mass).divided(
             max(self.parts, named.parts)).shaped(named.knots or ParameterSpace(self._names, bent).knots)
+        return replace(space, free=(*space.free, *(
+            own_name(name, session) for name in self.own
+            for session in range(2, len(self.trials_of_sessions) + 1))))
+
+    @property
+    def trials_of_sessions(self) -> tuple[int, ...]:
+        """The numbers of trials of each session; empty: all are of one."""
+        return tuple(map(int, self.sessions.split()))
 
     @property
     def _names(self) -> tuple[str, ...]:

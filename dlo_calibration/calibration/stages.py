@@ -54,24 +54,26 @@ STOPPED_PATIENCE = 5.0  # s that a confirmation may take after a request to stop
 Confirm = Callable[[CalibrationResult], CalibrationResult]
 
 
-def examined(setting: Setting, fit: Fit) -> Fit:
+def examined(setting: Setting, fit: Fit, *, discretised: bool = True) -> Fit:
     """
     Return a fit with the examination around its best evaluation, and with the evaluation to report.
 
     A parameter that no trial excites gets its default instead of a random value, unless the fit becomes
     significantly worse. If the user stops, there is no examination.
+
+    :param discretised: whether the uncertainty contains the error of nodes and time step.
     """
     if fit.stopped:
         return replace(fit, examination=None)
     try:
-        examination, best = _examined(setting, fit)
+        examination, best = _examined(setting, fit, discretised)
     except CancelledError:
         return replace(fit, examination=None, stopped=True)
     count = examination.evaluations + fit.validated
     return replace(fit, best=best, validated=0, examination=replace(examination, evaluations=count))
 
 
-def _examined(setting: Setting, fit: Fit) -> tuple[Examination, Evaluation]:
+def _examined(setting: Setting, fit: Fit, discretised: bool) -> tuple[Examination, Evaluation]:
     """
     Return the examination, and the evaluation to report as the best.
 
@@ -80,7 +82,7 @@ def _examined(setting: Setting, fit: Fit) -> tuple[Examination, Evaluation]:
     trials, space, best = setting.trials, fit.space, fit.best
     assert best.residuals is not None
     default, sigma = space.default_point(), noise(trials)
-    finer = setting.pool.refined()
+    finer = setting.pool.refined() if discretised else None
     noisy = sigma > NO_NOISE and 'length_scale' not in space.free
     evaluate = setting.evaluate(space)
     drawn = with_other_noise(

@@ -21,7 +21,10 @@ from dlo_calibration.errors import InputError
 VERSION = 1
 MOST_PHOTOGRAPHS = 200
 MOST_TRIALS = 100
+MOST_FILMS = 10
+LONGEST_FILM = 3600.0  # s
 MOST_STEPS = 20  # of a trial
+MOST_HANDS = 8
 MOST_OBSTACLES = 20
 PEG, BOX = 'peg', 'box'
 MOST_CLICKS = 50  # of a photograph; likewise its known points and crossings
@@ -148,6 +151,55 @@ class PhotographEntry:
 
 
 @dataclass(frozen=True)
+class MarkEntry:
+    """
+    Clicks along the DLO in one image of a film; the line follows the DLO from there on, up to the next marks.
+
+    :param time: of the image [s].
+    :param clicks: (u, v), in order from the same end in all marks.
+    """
+
+    time: float = entry_field(lambda entry: entry.number(0.0, LONGEST_FILM))
+    clicks: tuple[Pixel, ...] = entry_field(_each('click', MOST_CLICKS, _pixel), ())
+
+
+@dataclass(frozen=True)
+class HeldEntry:
+    """
+    The point that a hand without a tag holds.
+
+    :param place: share of the length, from the first click's end.
+    :param height: of the hand above the table [m].
+    """
+
+    place: float = entry_field(lambda entry: entry.number(0.0, 1.0))
+    height: float = entry_field(lambda entry: entry.number(0.0, 2.0), 0.0)
+
+
+@dataclass(frozen=True)
+class FilmEntry:
+    """
+    What the person entered about a film.
+
+    :param id: names its file.
+    :param name: as the person knows it.
+    :param ruler: measured length of the board's ruler line [m].
+    :param held: what hands without a tag hold.
+    :param left_out: numbers of the trials, from 0, that are not used.
+    """
+
+    id: str = entry_field(_id)
+    name: str = entry_field(lambda entry: entry.text(NAME_LENGTH), '')
+    ruler: float = entry_field(lambda entry: entry.number(0.05, 0.2), 0.1)
+    marks: tuple[MarkEntry, ...] = entry_field(
+        _each('mark', MOST_CLICKS, lambda entry: entry.record(MarkEntry)), ())
+    held: tuple[HeldEntry, ...] = entry_field(
+        _each('held point', MOST_HANDS, lambda entry: entry.record(HeldEntry)), ())
+    left_out: tuple[int, ...] = entry_field(
+        _each('trial', MOST_TRIALS, lambda entry: entry.whole(0, MOST_TRIALS)), ())
+
+
+@dataclass(frozen=True)
 class ObstacleEntry:
     """
     An obstacle that stands on the table.
@@ -201,9 +253,12 @@ class Document:
         _each('trial', MOST_TRIALS, lambda entry: entry.record(TrialEntry)), ())
     obstacles: tuple[ObstacleEntry, ...] = entry_field(
         _each('obstacle', MOST_OBSTACLES, lambda entry: entry.record(ObstacleEntry)), ())
+    films: tuple[FilmEntry, ...] = entry_field(
+        _each('film', MOST_FILMS, lambda entry: entry.record(FilmEntry)), ())
 
     def __post_init__(self) -> None:
-        if len(self.by_id) < len(self.photographs):
+        ids = [*(photograph.id for photograph in self.photographs), *(film.id for film in self.films)]
+        if len(set(ids)) < len(ids):
             raise _refused('photographs', 'the same id twice', 'an id of its own for each')
         for number, trial in enumerate(self.trials, start=1):
             for identity in trial.photographs:

@@ -4,13 +4,14 @@
 """
 Project: a folder with everything that a person entered, which can be opened again.
 
-It holds `project.json` (the document), the original photographs, each named by its id, and `lens.yaml`.
-Removed photographs keep their files, so that removing can be undone.
+It holds `project.json` (the document), the original photographs and films, each named by its id, and
+`lens.yaml`.  Removed photographs keep their files, so that removing can be undone.
 """
 
 from __future__ import annotations
 
 from contextlib import suppress
+from dataclasses import replace
 import fcntl
 from functools import lru_cache
 from itertools import count
@@ -23,23 +24,34 @@ import string
 from threading import Lock
 from typing import Any
 
-from dlo_calibration.capture.document import BoardScale, Document, ID, NAME_LENGTH, PhotographEntry, SameScale
+from dlo_calibration.capture.document import (
+    BoardScale,
+    Document,
+    FilmEntry,
+    ID,
+    MOST_FILMS,
+    NAME_LENGTH,
+    PhotographEntry,
+    SameScale,
+)
 from dlo_calibration.capture.json_values import parsed
 from dlo_calibration.errors import InputError, safe_line, shortened, unwritable
 from dlo_calibration.reading import read_octets
+from dlo_calibration.vision.film import Film, read_film
 from dlo_calibration.vision.lens import Lens, read_lens
 from dlo_calibration.vision.photograph import Photograph, read_photograph
 from dlo_calibration.workspace.folder import REQUEST, SESSION
 from dlo_calibration.writing import make_folder, whole, write_file
 
 DOCUMENT, LENS, LOCK = 'project.json', 'lens.yaml', '.lock'
-PHOTOGRAPHS, CALIBRATION = 'photographs', 'result'  # folders in it
+PHOTOGRAPHS, FILMS, CALIBRATION = 'photographs', 'films', 'result'  # folders in it
 SCENE = 'obstacles.urdf'  # the obstacles of the document; also in the folder of the result
 MOST_OCTETS = 4 * 2**20  # of the document; a full one has 2 MB
 MOST_FILES = 400  # photographs, with the removed ones
 MOST_OCTETS_OF_ALL = 4 * 2**30  # of these
 LENS_OCTETS = 2**20  # of a camera calibration
 IN_MEMORY = 3  # decoded photographs; one of 12 megapixels takes 36 MB
+FILM_SUFFIX = '.film'  # whatever its kind
 SUFFIXES = {b'\xff\xd8\xff': '.jpg', b'\x89PN': '.png'}  # first bytes of a file -> its suffix
 
 
@@ -91,6 +103,8 @@ class Project:
                               'repeat the change; another window changed the document')
         for photograph in document.photographs:
             self.path(photograph.id)
+        for film in document.films:
+            self.film_path(film.id)
         write_file(self.folder / DOCUMENT, json.dumps(document.plain(), indent=1, allow_nan=False))
         self.document, self.revision = document, self.revision + 1
 
@@ -110,7 +124,7 @@ class Project:
         if len(files) >= MOST_FILES or sum(path.lstat().st_size for path in files) > MOST_OCTETS_OF_ALL:
             raise InputError(f'folder {self.folder}', f'{len(files)} photographs', 'fewer',
                              'continue in another folder')
-        identity = ''.join(secrets.choice(string.ascii_lowercase + string.digits) for _ in range(8))
+        identity = _new_id()
         entry = PhotographEntry(identity, name, self._next_scale(photograph))
         document = self.document.with_photograph(entry)
         write_file(self.folder / PHOTOGRAPHS / f'{identity}{SUFFIXES[octets[:3]]}', octets)
@@ -127,6 +141,49 @@ class Project:
                         return path
         raise InputError(f'photograph {identity}', 'no file in the folder of the project', 'its photograph',
                          'add it again')
+
+    def new_film(self) -> Path:
+        """
+        Return a path at which the content of a film can be written, for `add_film`.
+
+        :raises InputError: if there are too many films.
+        """
+        if len(self.document.films) >= MOST_FILMS:
+            raise InputError('films', f'more than {MOST_FILMS}', 'fewer', 'remove one')
+        make_folder(self.folder / FILMS)
+        return self.folder / FILMS / f'.{_new_id()}'
+
+    def add_film(self, path: Path, name: str) -> str:
+        """
+        Add a film to the document, and return its id.
+
+        :param path: of its content, see `new_film`; it is renamed.
+        :param name: of the file, as the person knows it; it is only shown.
+        :raises InputError: if it is no film.
+        """
+        name = shortened(safe_line(name), NAME_LENGTH) or 'film'
+        try:
+            read_film(path)
+        except InputError as error:
+            raise InputError(f'film {name}', error.came, error.expected, error.remedy) from error
+        identity = _new_id()
+        path.rename(self.folder / FILMS / f'{identity}{FILM_SUFFIX}')
+        films = (*self.document.films, FilmEntry(identity, name))
+        self.change(replace(self.document, films=films), self.revision)
+        return identity
+
+    def film_path(self, identity: str) -> Path:
+        """Return the file of a film, given by its id."""
+        path = self.folder / FILMS / f'{identity}{FILM_SUFFIX}'
+        with suppress(OSError):
+            if ID.fullmatch(identity) and stat.S_ISREG(path.lstat().st_mode):
+                return path
+        raise InputError(f'film {identity}', 'no file in the folder of the project', 'its film',
+                         'add it again')
+
+    def film(self, identity: str) -> Film:
+        """Return a film, given by its id."""
+        return read_film(self.film_path(identity))
 
     def photograph(self, identity: str) -> Photograph:
         """
@@ -175,6 +232,8 @@ class Project:
             document = Document.of(_json(path))
             for photograph in document.photographs:
                 self.path(photograph.id)
+            for film in document.films:
+                self.film_path(film.id)
             return document
         except InputError as error:
             aside = _free_name(path)
@@ -192,6 +251,10 @@ class Project:
         return scale if isinstance(scale, BoardScale) else None
 
 
+def _new_id() -> str:
+    return ''.join(secrets.choice(string.ascii_lowercase + string.digits) for _ in range(8))
+
+
 def _refuse_links(folder: Path) -> None:
     """
     Check that a project will read and write only regular files and folders in its folder.
@@ -200,8 +263,8 @@ def _refuse_links(folder: Path) -> None:
 
     :raises InputError: for the first link, FIFO or other special file.
     """
-    paths = [folder / name for name in (DOCUMENT, LENS, LOCK, PHOTOGRAPHS, CALIBRATION, SESSION, REQUEST,
-                                      SCENE)]
+    paths = [folder / name for name in (DOCUMENT, LENS, LOCK, PHOTOGRAPHS, FILMS, CALIBRATION, SESSION,
+                                      REQUEST, SCENE)]
     try:
         while paths:
             path = paths.pop()

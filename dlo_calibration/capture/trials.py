@@ -193,12 +193,14 @@ class Drafts:
     :param trials: in the order of the document.
     :param mass: of the DLO [kg]; 0: unknown.
     :param placed: the obstacles, or why they cannot be placed, in the order of the document.
+    :param filmed_diameter: diameter of the DLO as a film shows it [m]; None: none does.
     """
 
     photographs: Mapping[str, Measurement]
     trials: tuple[TrialDraft, ...]
     mass: float = 0.0
     placed: tuple[PlacedObstacle, ...] = ()
+    filmed_diameter: float | None = None
 
     @cached_property
     def complete(self) -> tuple[Trial, ...]:
@@ -219,20 +221,13 @@ class Drafts:
     @property
     def diameter(self) -> float | None:
         """Diameter of the DLO [m]; None: neither given nor measured yet."""
-        return next((photograph.thickness for photograph in self.photographs.values()), None)
+        measured = next((photograph.thickness for photograph in self.photographs.values()), None)
+        return self.filmed_diameter if measured is None else measured
 
     @property
     def options(self) -> dict[str, Any]:
-        """
-        The options of these trials, by name.
-
-        The table is the plane of the scale; the search for the radius begins at the measured one.
-        """
-        options: dict[str, Any] = {'table': True, 'table_height': 0.0, 'mass': self.mass}
-        if self.diameter is not None:
-            value = BY_NAME['self_collision'].value(self.diameter / 2)
-            options['self_collision'] = min(max(value, 0.0), SCALE)
-        return Options.of(options).flat()
+        """The options of these trials, by name."""
+        return measured_options(self.diameter, self.mass)
 
     def plain(self) -> dict[str, Any]:
         """Return the drafts as plain values, for the page."""
@@ -285,6 +280,22 @@ class Drafter:
             goal, held_in_goal = entry.goal, held_after(entry.steps, held)
         return Drafts(photographs, tuple(draft for _, draft in self._drafts.values()), document.dlo.mass,
                       place_obstacles(document, photographs))
+
+
+def measured_options(diameter: float | None, mass: float = 0.0) -> dict[str, Any]:
+    """
+    Return the options of trials that a camera observed, by name.
+
+    The table is the plane of the scale; the search for the radius begins at the measured one.
+
+    :param diameter: of the DLO [m]; None: unknown.
+    :param mass: of the DLO [kg]; 0: unknown.
+    """
+    options: dict[str, Any] = {'table': True, 'table_height': 0.0, 'mass': mass}
+    if diameter is not None:
+        value = BY_NAME['self_collision'].value(diameter / 2)
+        options['self_collision'] = min(max(value, 0.0), SCALE)
+    return Options.of(options).flat()
 
 
 def write_session(path: Path, trials: Sequence[Trial], options: Mapping[str, Any]) -> None:

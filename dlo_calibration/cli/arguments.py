@@ -22,10 +22,15 @@ _NUMBERED = re.compile(r'[xy]?\d+$')  # distinguishes the options of parts, knot
 _FLAG = re.compile('^--[a-z0-9_]+(?==|$)')
 
 
-def add_source(parser: argparse.ArgumentParser, optional: bool = False) -> None:
-    """Add the arguments that name a session or a request, and the options to use on it."""
-    parser.add_argument('session', metavar='SESSION', type=Path, nargs='?' if optional else None,
-                        help='an MCAP file, the folder of a rosbag2 recording, or an XML request')
+def add_source(parser: argparse.ArgumentParser, several: bool = False) -> None:
+    """
+    Add the arguments that name a session or a request, and the options to use on it.
+
+    :param several: whether there may be any number of them, also none.
+    """
+    parser.add_argument('session', metavar='SESSION', type=Path, nargs='*' if several else None,
+                        help='an MCAP file, the folder of a rosbag2 recording, or an XML request'
+                        + '; several of the same DLO are calibrated together' * several)
     add_without(parser)
     add_common_arguments(parser)
     add_options(parser)

@@ -15,6 +15,7 @@ from dlo_calibration.cli.arguments import add_options, given_options
 from dlo_calibration.cli.output import print_message
 from dlo_calibration.errors import InputError, one_of
 from dlo_calibration.export import export_mjcf, export_sdf, export_usd, sdf_meshes
+from dlo_calibration.export.draws import drawn_dlos, draws_table
 from dlo_calibration.export.mjcf import FORMS as MJCF_FORMS
 from dlo_calibration.export.rope import ExportedRope
 from dlo_calibration.export.usd import FORMS as USD_FORMS
@@ -22,6 +23,8 @@ from dlo_calibration.files.chain_file import read_chain_file
 from dlo_calibration.files.result import read_result
 from dlo_calibration.writing import write_file
 
+DRAWS_TABLE = 'draws.csv'
+UNDETERMINED = ('keep', 'vary')
 USED = ('nodes', 'table', 'table_height', 'scene')  # options
 #: Format -> what makes its text, and the names of its forms, the first one by default.
 FORMATS: Mapping[str, tuple[Callable[..., str], tuple[str, ...]]] = {
@@ -38,6 +41,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'where the DLO lies: a CSV file with rows x,y,z [m], first point to last, or an XML document'))
     parser.add_argument('--output', metavar='FILE', type=Path, required=True, help='the file to write')
     parser.add_argument('--form', metavar='NAME', help=f'form of the format ({forms}; default: the first)')
+    parser.add_argument('--draws', metavar='N', type=int, help=(
+        'write N files, FILE_1 and so on, with parameters drawn from the posterior, and draws.csv'))
+    parser.add_argument('--seed', metavar='S', type=int, default=1,
+                        help='random seed of the draws; default 1')
+    parser.add_argument('--undetermined', choices=UNDETERMINED, default=UNDETERMINED[0], help=(
+        'what draws do with a parameter that the trials do not determine: keep its value (default), or vary '
+        'it over the range that the trials allow'))
     add_options(parser, USED, title='options of the DLO (default: those of the result)')
 
 
@@ -54,11 +64,25 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     options = replace(description.file_options, values=recorded).options(given_options(chosen))
     chain = read_chain_file(chosen.start)
     form = {} if chosen.form is None else {'form': chosen.form}
-    text = export(description, chain, options=options, **form)
+    texts = {chosen.output: ''}
+    if chosen.draws is None:
+        texts[chosen.output] = export(description, chain, options=options, **form)
+    else:
+        drawn = drawn_dlos(description, chain, options, chosen.draws, chosen.seed,
+                           vary=chosen.undetermined == 'vary')
+        texts = {chosen.output.with_stem(f'{chosen.output.stem}_{k}'):
+                 export(dlo, chain, options=options, **form)
+                 for k, dlo in enumerate(drawn, start=1)}
     for name, content in sdf_meshes(options).items() if chosen.format == 'sdf' else ():
         write_file(chosen.output.parent / name, content)
-    write_file(chosen.output, text)
+    for path, text in texts.items():
+        write_file(path, text)
+    if chosen.draws is not None:
+        write_file(chosen.output.parent / DRAWS_TABLE, draws_table(drawn, [path.name for path in texts]))
     for warning in ExportedRope.of(description, chain, options).warnings:
         print_message(warning)
-    print_message(f'the DLO is in {chosen.output}')
+    first, *_, last = *texts, *texts
+    print_message(f'the DLO is in {chosen.output}' if chosen.draws is None else
+                  f'{chosen.draws} draws of the DLO are in {first} to {last.name}, and their values in '
+                  f'{DRAWS_TABLE}')
     return 0

@@ -21,13 +21,13 @@ from dlo_calibration.errors import InputError, SimulationError
 from dlo_calibration.files.result import HOW, read_result
 from dlo_calibration.signals import StopFlag
 from dlo_calibration.workspace.folder import CalibrationFolder, EVALUATIONS, FILES, REPORT, RESULT, SESSION
-from dlo_calibration.workspace.source import read_source, Source
+from dlo_calibration.workspace.source import read_source, read_sources, Source
 from dlo_calibration.workspace.validation import validated
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    add_source(parser, optional=True)
+    add_source(parser, several=True)
     written = parser.add_mutually_exclusive_group()
     written.add_argument('--output', metavar='DIR', type=Path,
                          help=f'write {RESULT}, {SESSION}, {REPORT} and {EVALUATIONS} to this folder; until '
@@ -45,17 +45,22 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
             if not CalibrationFolder.is_unfinished(chosen.resume):
                 return _finished(chosen, make_simulator)
             folder = stack.enter_context(closing(CalibrationFolder(chosen.resume)))
-            selection = selected(chosen, chosen.session or CalibrationFolder.input_of(chosen.resume))
-            if chosen.session is None:  # the copy of the input has the calibrator's names
+            _require_one(chosen.session)
+            path = chosen.session[0] if chosen.session else CalibrationFolder.input_of(chosen.resume)
+            selection = selected(chosen, path)
+            if not chosen.session:  # the copy of the input has the calibrator's names
                 selection = replace(selection, remap={})
-            selection = folder.resume(selection)
-        elif chosen.session is None:
+            selections = [folder.resume(selection)]
+        elif not chosen.session:
             raise InputError('fit', 'no SESSION', 'a session or a request', 'name it, or --resume DIR')
         else:
-            selection = selected(chosen)
-        source = read_source(selection, print_message).require_trials()
+            selections = [selected(chosen, path) for path in chosen.session]
+        source = read_sources(selections, print_message).require_trials()
+        if source.options.own and len(source.options.trials_of_sessions) < 2:
+            raise InputError('--own', 'one session', 'several sessions of the DLO',
+                             'name them all: fit FIRST SECOND --own NAME')
         output = chosen.output
-        if output is None and 'output_directory' in selection.options:
+        if output is None and 'output_directory' in selections[0].options:
             output = Path(source.options.output_directory)
         if folder is None and output is not None:
             folder = stack.enter_context(closing(CalibrationFolder(output)))
@@ -63,6 +68,16 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
             folder.begin(source, print_message)
         _fit(chosen, source, folder, make_simulator)
     return 0
+
+
+def _require_one(sessions: list[Path]) -> None:
+    """
+    Check that no more than one session is resumed: the folder has all trials in one.
+
+    :raises InputError: if there are several.
+    """
+    if len(sessions) > 1:
+        raise InputError('--resume', f'{len(sessions)} sessions', 'none, or one', 'leave them out')
 
 
 def _fit(chosen: argparse.Namespace, source: Source, folder: CalibrationFolder | None,
@@ -120,7 +135,8 @@ def _finished(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> i
     print_message(f'nothing to resume: the calibration is finished, and its result is {folder / RESULT}')
     if chosen.json:
         file = read_result(folder / RESULT)
-        path = chosen.session or CalibrationFolder.input_of(folder)
+        _require_one(chosen.session)
+        path = chosen.session[0] if chosen.session else CalibrationFolder.input_of(folder)
         source = read_source(selected(chosen, path), print_message, file.file_options).require_trials()
         trials = [trial for trial in source.trials if trial.name in file.trials]
         result = replace(validated(file, trials, source.options, make_simulator),

@@ -23,8 +23,10 @@ PROGRAM = 'dlo-calibration'  # as installed; begins each line of an error
 VERBS = {
     'capture': 'open the page in which photographs become trials, and calibrate there',
     'trace': "find a DLO's middle line in a photograph from a few rough clicks, and with a scale its chain",
+    'track': 'follow a DLO and the hands that move it through a film, and cut it into a session of trials',
     'fit': 'find the parameters that explain a session best',
     'validate': 'simulate a session with the parameters of a result, without fitting',
+    'check': 'tell whether a session still shows the DLO of a result, and which parameter has changed if not',
     'simulate': 'predict what a calibrated DLO does in the actions of a session or a request',
     'plan': 'find actions that bring a calibrated DLO from one configuration to another',
     'export': 'write a calibrated DLO as a file for another simulator',

@@ -49,7 +49,7 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
                               print_message, numbers, obstacles)
     animations: list[Path] = []
     if chosen.animation and result is not None:
-        physical = result.space.physical(result.values, result.length)
+        physical = result.space.physical(result.values, result.length)  # of the first session
         with closing(make_simulator(source.options)) as simulator:
             animations = write_animations(result.trials, simulator, physical, chosen.output,
                                           print_message, numbers, obstacles)

@@ -15,7 +15,7 @@ from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.cli.output import print_json, standard_output
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.chain_file import write_chain
-from dlo_calibration.model.chain import MOST_POINTS
+from dlo_calibration.model.chain import Floats, MOST_POINTS
 from dlo_calibration.vision.axis import axis_of, measured_diameter
 from dlo_calibration.vision.board import find_board
 from dlo_calibration.vision.lens import read_lens
@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     """Execute the verb; return the exit code."""
-    clicks = np.array([_pair(word, '--points', 'u,v') for word in chosen.points.split()]).reshape(-1, 2)
+    clicks = pixels_of(chosen.points, '--points')
     _check(chosen)
     photograph = read_photograph(chosen.photograph, f'photograph {chosen.photograph}')
     scale = _scale(chosen, photograph)
@@ -82,10 +82,15 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     return 0
 
 
+def check_count(count: int) -> None:
+    """Refuse a number of points that no chain has."""
+    if not COUNTS[0] <= count <= COUNTS[1]:
+        raise InputError('--count', str(count), f'{COUNTS[0]} to {COUNTS[1]}', 'choose a number')
+
+
 def _check(chosen: argparse.Namespace) -> None:
     """Refuse values that are out of range, and an output without a scale."""
-    if not COUNTS[0] <= chosen.count <= COUNTS[1]:
-        raise InputError('--count', str(chosen.count), f'{COUNTS[0]} to {COUNTS[1]}', 'choose a number')
+    check_count(chosen.count)
     if chosen.diameter is not None and not 0 < chosen.diameter <= LARGEST_DIAMETER:
         raise InputError('--diameter', f'{chosen.diameter:g} m', f'above 0, at most {LARGEST_DIAMETER:g} m',
                          'give it in metres')
@@ -99,15 +104,26 @@ def _scale(chosen: argparse.Namespace, photograph: Photograph) -> Scale | None:
     if chosen.board:
         pixels, table = find_board(photograph.pixels)
     elif chosen.scale:
-        pairs = [word.partition('=') for word in chosen.scale.split()]
-        for pair in pairs:
-            if not pair[1]:
-                raise InputError('--scale', repr(pair[0]), 'u,v=x,y',
-                                 'write e.g. "100,200=0,0 900,210=0.3,0 ..."')
-        pixels, table = (np.array([_pair(pair[k], '--scale', 'u,v=x,y') for pair in pairs]) for k in (0, 2))
+        pixels, table = places_of(chosen.scale)
     else:
         return None
     return scale_from_points(pixels, table, photograph.size, lens, photograph.focal_length)
+
+
+def places_of(text: str) -> tuple[Floats, Floats]:
+    """Return pixels (k, 2) and places on the table (k, 2) [m] of the option --scale."""
+    pairs = [word.partition('=') for word in text.split()]
+    for pair in pairs:
+        if not pair[1]:
+            raise InputError('--scale', repr(pair[0]), 'u,v=x,y',
+                             'write e.g. "100,200=0,0 900,210=0.3,0 ..."')
+    pixels, table = (np.array([_pair(pair[k], '--scale', 'u,v=x,y') for pair in pairs]) for k in (0, 2))
+    return pixels, table
+
+
+def pixels_of(text: str, option: str) -> Floats:
+    """Return the pixels (k, 2) of an option "u,v u,v ..."."""
+    return np.array([_pair(word, option, 'u,v') for word in text.split()]).reshape(-1, 2)
 
 
 def _pair(word: str, option: str, form: str) -> tuple[float, float]:

@@ -15,7 +15,7 @@ import numpy as np
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.evaluation.residuals import compared_rows, ResidualLayout
 from dlo_calibration.model.chain import Floats, frozen_array
-from dlo_calibration.model.parameters import HANDS, ParameterSpace
+from dlo_calibration.model.parameters import HANDS, of_session, ParameterSpace
 from dlo_calibration.model.score import PointErrors, residuals, TrialScore
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.simulation.protocol import Job, Rollout, simulate_all, Simulator, Stop
@@ -107,12 +107,15 @@ class Evaluator:
     def jobs(self, point: Floats) -> list[Job]:
         """Return the jobs of a (d,) point of the unit cube, one for each trial."""
         physical = self.space.physical(self.space.values(point), self._length)
-        errors = tuple(physical.get(name, 0.0) for name in HANDS)
-        return [(trial, physical) for trial in self._with_hands(errors)]
+        own = {session: of_session(physical, session)
+               for session in sorted({trial.session for trial in self.trials})}
+        errors = tuple((session, *(values.get(name, 0.0) for name in HANDS))
+                       for session, values in own.items())
+        return [(trial, own[trial.session]) for trial in self._with_hands(errors)]
 
-    def _trials_with_hands(self, errors: tuple[float, ...]) -> tuple[Trial, ...]:
-        named = dict(zip(HANDS, errors, strict=True))
-        return tuple(with_hands(trial, named) for trial in self.trials)
+    def _trials_with_hands(self, errors: tuple[tuple[float, ...], ...]) -> tuple[Trial, ...]:
+        named = {session: dict(zip(HANDS, shifts, strict=True)) for session, *shifts in errors}
+        return tuple(with_hands(trial, named[trial.session]) for trial in self.trials)
 
     def evaluated(self, index: int, point: Floats, outcomes: Sequence[Rollout | SimulationError]
                   ) -> Evaluation:

@@ -28,6 +28,9 @@ from dlo_calibration.simulation.scene import Obstacle
 
 NAME = 'dlo'
 SCENE = 'scene'  # holds the DLO and the obstacles, if there are any
+#: Of stretch and shear, relative to their stiffness [s]: with more, `SolverVBD` converges so slowly that a
+#: DLO sags (benchmark/results/export_newton_cantilever.md).
+MOST_DAMPING = 1e-3
 FORMS = ('newton-1.6', 'newton-1.4')
 
 
@@ -151,8 +154,10 @@ def _stiffnesses(rope: ExportedRope) -> list[str]:
     stretch, shear, bend, twist = _values(rope)
     lines = [f'float physics:density = {_number(rope.masses.sum() / _section(rope) / rope.length)}']
     for name, value in (('Stretch', stretch), ('Shear', shear), ('Bend', bend), ('Twist', twist)):
+        damping = min(rope.internal_damping, MOST_DAMPING) if name in ('Stretch', 'Shear') else \
+            rope.internal_damping
         lines += [f'float physics:curves{name}Stiffness = {_number(value)}',
-                  f'float newton:curves{name}Damping = {_number(value * rope.internal_damping)}']
+                  f'float newton:curves{name}Damping = {_number(value * damping)}']
     return lines
 
 
@@ -210,6 +215,9 @@ def _about(rope: ExportedRope, moduli: bool) -> list[str]:
     lost = [f'drag, {measured(rope.drag, "1/s")}']
     if moduli:
         lost.append(f'internal damping, {measured(rope.internal_damping, "s")}; twist')
+    elif rope.internal_damping > MOST_DAMPING:
+        lost.append(f'damping of stretch and shear above {measured(MOST_DAMPING, "s")}, with which the DLO '
+                    'would sag')
     if rope.bending_friction > 0:
         lost.append('friction between strands, bending_friction')
     if rope.locking > 0:

@@ -98,8 +98,13 @@ class Session:
 
 def trial_records(trials: Iterable[Trial], frame_id: str = 'world') -> tuple[Record, ...]:
     """Return the records of a session in which a robot does the given trials; see `trial_messages`."""
+    return message_records(trial_messages(tuple(trials), frame_id))
+
+
+def message_records(messages: Iterable[Message]) -> tuple[Record, ...]:
+    """Return the records of a session with the given messages."""
     types, records = bag_types(), []
-    for message in trial_messages(tuple(trials), frame_id):
+    for message in messages:
         name = INPUT_TYPES[message.kind]
         octets = encode(built(types, message), name)
         records.append(Record(f'/calibrator/{message.kind}', name, octets, message.stamp))

@@ -16,6 +16,7 @@ from dlo_calibration.messages.codec import ActionMessage, ChainMessage, GOAL, IN
 from dlo_calibration.model.action import Hand
 from dlo_calibration.model.chain import Chain, Floats, MINIMUM_SPACING
 from dlo_calibration.model.trial import Goal, Trial
+from dlo_calibration.observation.episodes import Episode
 
 SAME_OFFSET = 1e-3  # of a segment
 BEFORE = NANOSECONDS // 100  # time between the two initial chains that give a velocity
@@ -37,6 +38,24 @@ def trial_messages(trials: Sequence[Trial], frame_id: str) -> list[Message]:
         messages += _messages(trial, frame_id, zero)
         end = max([goal.time for goal in trial.goals] + [hand.end for hand in trial.hands])
         zero += round(end * NANOSECONDS) + 10 * NANOSECONDS
+    return messages
+
+
+def episode_messages(cut: Sequence[Episode], frame_id: str, zero: int) -> list[Message]:
+    """
+    Return messages from which a `TrialCollector` makes the trials of episodes of a film.
+
+    :param zero: stamp of the film's time 0 [ns], > 0.
+    """
+    def at(time: float) -> int:
+        return zero + round(time * NANOSECONDS)
+
+    messages: list[Message] = []
+    for episode in cut:
+        start = min(hand.start for hand in episode.hands)
+        messages.append(ChainMessage(INITIAL, at(start) - BEFORE, frame_id, episode.initial))
+        messages.append(action_message(episode.hands, at(start), frame_id))
+        messages += [ChainMessage(GOAL, at(time), frame_id, Chain(points)) for time, points in episode.goals]
     return messages
 
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 import math
+import re
 from typing import Any, Mapping, Sequence
 
 import numpy as np
@@ -194,7 +195,35 @@ PARAMETERS: tuple[Parameter, ...] = (
                 -25.0, 25.0, 50.0, 'how curved the DLO is there when nothing bends it (see parts)',
                 linear=True, neutral=0.0) for name in knot_names(KNOTS[-1])),
 )
-BY_NAME: Mapping[str, Parameter] = {parameter.name: parameter for parameter in PARAMETERS}
+
+
+def owner(name: str) -> tuple[str, int]:
+    """Return the parameter of a name, and the number of the session whose own value it is; 0: of all."""
+    match = _OWN.fullmatch(name)
+    return (name, 0) if match is None else (match[1], int(match[2]))
+
+
+def own_name(name: str, session: int) -> str:
+    """Return the name of the value that a session, counted from 1, has for itself; the first has `name`."""
+    return name if session == 1 else f'{name}_session_{session}'
+
+
+class _Parameters(dict[str, Parameter]):
+    """The parameters by name; those of sessions are made when they are asked for."""
+
+    def __missing__(self, name: str) -> Parameter:
+        base, session = owner(name)
+        if not session or not super().__contains__(base):
+            raise KeyError(name)
+        return replace(self[base], name=name, quantity=f'{self[base].quantity} in session {session}')
+
+    def __contains__(self, name: object) -> bool:
+        return super().__contains__(owner(name)[0] if isinstance(name, str) else name)
+
+
+MOST_SESSIONS = 20  # of one DLO
+_OWN = re.compile(r'(\w+?)_session_([2-9]|1\d|20)')
+BY_NAME: Mapping[str, Parameter] = _Parameters({parameter.name: parameter for parameter in PARAMETERS})
 PART_NAMES = tuple(part_name(part) for part in range(2, MOST_PARTS + 1))
 #: Of the hands, not of the DLO.
 HANDS = ('hand_delay', 'hand_shift_x', 'hand_shift_y', 'hand_shift_z')
@@ -320,6 +349,11 @@ class ParameterSpace:
         """Return whether physical values can be given in absolute units."""
         return self.mass > 0 or 'mass' in self.free or 'mass' in self.fixed
 
+    def holds_in(self, name: str, session: int) -> bool:
+        """Tell whether the value of this name holds in a session, counted from 1."""
+        own = owner(name)[1]
+        return own == session if own else own_name(name, session) not in self.free or session == 1
+
     def values(self, point: Sequence[float] | Floats) -> dict[str, float]:
         """Return the free parameters on the 0..100 scale at a (d,) point of the unit cube."""
         return {name: float(u) * SCALE for name, u in zip(self.free, point, strict=True)}
@@ -341,6 +375,8 @@ class ParameterSpace:
         """
         physical = {p.name: p.physical(values.get(p.name, self.fixed.get(p.name, p.default)))
                     for p in self.parameters}
+        for name in filter(lambda name: owner(name)[1], (*values, *self.fixed)):
+            physical[name] = BY_NAME[name].physical(values.get(name, self.fixed.get(name, 0.0)))
         if 'mass' not in values and 'mass' not in self.fixed:
             physical['mass'] = self.mass if self.mass > 0 else ASSUMED_DENSITY * length
         return physical
@@ -357,6 +393,12 @@ class ParameterSpace:
         if parameter.per_weight and not self.mass_known:
             return physical / (ASSUMED_DENSITY * GRAVITY), f'{parameter.unit} {PER_WEIGHT}'
         return physical, parameter.unit
+
+
+def of_session(physical: Mapping[str, float], session: int) -> dict[str, float]:
+    """Return the physical values that hold in a session, counted from 1, by parameter name."""
+    own = {owner(name)[0]: value for name, value in physical.items() if owner(name)[1] == session}
+    return {**{name: value for name, value in physical.items() if not owner(name)[1]}, **own}
 
 
 def natural_curvature(physical: Mapping[str, float], fractions: Floats) -> Floats:

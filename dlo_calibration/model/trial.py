@@ -57,6 +57,7 @@ class Trial:
     :param goals: one or more, in the order of their time.
     :param velocity: (n, 3) [m/s] of the initial points; None: the DLO is at rest.
     :param places: (n,) [m] arc lengths of the points at rest, from 0; None: those of the initial chain.
+    :param session: number of the session, from 1; sessions may have parameters of their own.
     :param loads: whether a simulation shall measure the loads of the DLO on its way, which takes time.
     """
 
@@ -67,6 +68,7 @@ class Trial:
     velocity: Floats | None = None
     places: Floats | None = None
     loads: bool = False
+    session: int = 1
 
     def __post_init__(self) -> None:
         thing = f'trial {self.name!r}'

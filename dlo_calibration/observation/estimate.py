@@ -16,7 +16,7 @@ from typing import Iterator, Sequence
 import numpy as np
 
 from dlo_calibration.model.chain import bezier_curve, Chain, Floats, frozen_array, MINIMUM_SPACING
-from dlo_calibration.model.parameters import BY_NAME, GRAVITY, ParameterSpace, SCALE
+from dlo_calibration.model.parameters import BY_NAME, GRAVITY, owner, ParameterSpace, SCALE
 from dlo_calibration.model.trial import shown_goals, Trial
 from dlo_calibration.observation.noise import noise, smooth
 from dlo_calibration.observation.table import RESTING_BAND, resting_level
@@ -293,7 +293,7 @@ def prior_estimates(trials: Sequence[Trial], space: ParameterSpace,
         weight = space.physical({}, length)['mass'] / length * GRAVITY
         estimates['flexibility'] = _flexibility(load, hold, weight)
         estimates['elasticity'] = _elasticity(stretch, weight)
-    return {name: estimates.get(name, UNKNOWN) for name in space.free}
+    return {name: estimates.get(owner(name)[0], UNKNOWN) for name in space.free}
 
 
 def start_point(trials: Sequence[Trial], space: ParameterSpace, table_height: float | None) -> Floats:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_calibration.model.chain import Chain, Floats, frozen_array, grip_place
-from dlo_calibration.model.parameters import BY_NAME, GRAVITY, ParameterSpace
+from dlo_calibration.model.parameters import BY_NAME, GRAVITY, owner, ParameterSpace
 from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.observation.noise import noise
 
@@ -100,7 +100,8 @@ def excites(trials: Sequence[Trial], space: ParameterSpace, table_height: float 
             'damping': any(not goal.stable for goal in trial.goals),
             'internal_damping': any(not goal.stable for goal in trial.goals),
             'mass': not all(p.per_weight <= (p.name in space.free) for p in BY_NAME.values())}
-        rows.append([shown.get(name, True) for name in space.free])
+        rows.append([shown.get(owner(name)[0], True) and space.holds_in(name, trial.session)
+                     for name in space.free])
     return frozen_array(np.reshape(rows, (len(trials), space.dimension)), bool)
 
 

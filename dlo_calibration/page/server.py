@@ -13,7 +13,7 @@ from pathlib import Path
 import re
 import secrets
 import socket
-from typing import Any, Callable
+from typing import Any, AsyncIterator, Callable
 from urllib.parse import unquote
 
 from aiohttp import web
@@ -25,12 +25,14 @@ from dlo_calibration.errors import InputError
 from dlo_calibration.page.guard import BROKEN, Guard, HTTP_LOG, LOG, protect, REPORT_POLICY
 from dlo_calibration.page.studio import Studio
 from dlo_calibration.vision.board import board_document
+from dlo_calibration.vision.film import MAXIMUM_OCTETS
 
 PAGE = Path(__file__).parent / 'static'
 TYPES = {'.html': 'text/html', '.css': 'text/css', '.js': 'text/javascript', '.svg': 'image/svg+xml',
          '.png': 'image/png', '.xml': 'application/xml', '.urdf': 'application/xml', '.csv': 'text/csv',
          '.pdf': 'application/pdf', '.mcap': 'application/octet-stream'}
 LARGEST_PHOTOGRAPH = 64 * 2**20  # bytes
+LARGEST_FILM = MAXIMUM_OCTETS
 LARGEST_TEXT = 2 * 2**20  # bytes of anything else
 TICK = 0.2  # s between two checks of the background work
 PAUSE = 5.0  # s after a check that failed
@@ -111,7 +113,12 @@ def application(studio: Studio, events: Events, guard: Guard, token: str) -> web
             ('GET', '/api/photographs/{id}/picture', routes.picture),
             ('POST', '/api/lens', routes.set_lens), ('DELETE', '/api/lens', routes.remove_lens),
             ('GET', '/api/board/{paper}.pdf', routes.board), ('POST', '/api/calibrate', routes.calibrate),
-            ('POST', '/api/stop', routes.stop), ('GET', '/api/events', events.answer),
+            ('POST', '/api/check', routes.check), ('POST', '/api/stop', routes.stop),
+            ('GET', '/api/events', events.answer),
+            ('POST', '/api/films', routes.add_film), ('GET', '/api/films/{id}/video', routes.video),
+            ('GET', '/api/films/{id}/frame', routes.frame), ('GET', '/api/films/{id}/line', routes.line),
+            ('GET', '/api/films/{id}/simulated', routes.simulated),
+            ('POST', '/api/films/{id}/follow', routes.follow),
             ('GET', '/api/film/{number}', routes.film), ('GET', '/api/files/{name}', routes.file),
             ('GET', '/api/topics', routes.topics), ('POST', '/api/topics', routes.add_topic_image),
             ('POST', '/api/send', routes.send)):
@@ -184,6 +191,11 @@ class Routes:
         """Begin to calibrate."""
         return await self._changed(partial(self._studio.calibrate, await _object(request)))
 
+    async def check(self, request: web.Request) -> web.StreamResponse:
+        """Compare the trials with a result."""
+        octets = await _octets(request, LARGEST_TEXT)
+        return await self._answer(partial(self._studio.check, octets, _name(request)))
+
     async def stop(self, request: web.Request) -> web.StreamResponse:
         """End the calibration with the best so far."""
         return await self._changed(self._studio.stop)
@@ -195,6 +207,42 @@ class Routes:
             raise web.HTTPNotFound
         identity = request.query.get('photograph', '')
         return await self._answer(partial(self._studio.film, int(number), identity))
+
+    async def add_film(self, request: web.Request) -> web.StreamResponse:
+        """Take a film, piece by piece."""
+        path = await asyncio.to_thread(self._studio.new_film)
+        try:
+            with path.open('xb') as stream:
+                async for piece in _pieces(request, LARGEST_FILM):
+                    await asyncio.to_thread(stream.write, piece)
+            return await self._changed(partial(self._studio.add_film, path, _name(request)))
+        finally:
+            path.unlink(missing_ok=True)
+
+    async def video(self, request: web.Request) -> web.StreamResponse:
+        """Give the file of a film, or the part of it that the browser wants to play."""
+        path = await asyncio.to_thread(self._studio.film_path, request.match_info['id'])
+        return web.FileResponse(path, headers={'Content-Type': 'video/mp4'})
+
+    async def frame(self, request: web.Request) -> web.StreamResponse:
+        """Give an image of a film as a JPEG."""
+        time = request.query.get('time', '0')
+        if not re.fullmatch(r'[0-9]{1,5}(\.[0-9]{1,6})?', time):
+            raise web.HTTPBadRequest(reason='the time of an image is a number of seconds')
+        octets = await asyncio.to_thread(self._studio.film_frame, request.match_info['id'], float(time))
+        return web.Response(body=octets, content_type='image/jpeg')
+
+    async def line(self, request: web.Request) -> web.StreamResponse:
+        """Give where the DLO was seen in a film."""
+        return await self._answer(partial(self._studio.film_line, request.match_info['id']))
+
+    async def simulated(self, request: web.Request) -> web.StreamResponse:
+        """Give the simulated DLO over a film."""
+        return await self._answer(partial(self._studio.film_simulated, request.match_info['id']))
+
+    async def follow(self, request: web.Request) -> web.StreamResponse:
+        """Begin to follow the DLO through a film."""
+        return await self._changed(partial(self._studio.follow, request.match_info['id']))
 
     async def file(self, request: web.Request) -> web.StreamResponse:
         """Give a file to save, or the report to read."""
@@ -232,22 +280,26 @@ class Routes:
 
 async def _octets(request: web.Request, most: int) -> bytes:
     """Return the content of a request; refuse a large one before it is all in memory."""
+    return b''.join([piece async for piece in _pieces(request, most)])
+
+
+async def _pieces(request: web.Request, most: int) -> AsyncIterator[bytes]:
+    """Give the content of a request piece by piece; refuse a large one."""
     def check(count: int) -> None:
         if count > most:
             raise web.HTTPRequestEntityTooLarge(
                 most, count, reason=f'the content has more than {most / 1e6:.0f} MB; send a smaller file')
 
     check(request.content_length or 0)
-    pieces, count = [], 0
+    count = 0
     try:
         async for piece in request.content.iter_any():
-            pieces.append(piece)
             count += len(piece)
             check(count)
+            yield piece
     except BROKEN as error:
         raise web.HTTPBadRequest(
             reason='the content is damaged, or ended too early; send it again') from error
-    return b''.join(pieces)
 
 
 async def _object(request: web.Request) -> dict[str, Any]:

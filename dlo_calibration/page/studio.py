@@ -6,28 +6,35 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 import threading
 from typing import Any, Mapping
 
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.capture.document import Document
+from dlo_calibration.capture.document import Document, FilmEntry
 from dlo_calibration.capture.hands import described
 from dlo_calibration.capture.obstacles import scene_document
 from dlo_calibration.capture.project import Project, SCENE
-from dlo_calibration.capture.trials import Drafter, Drafts, write_request, write_session
+from dlo_calibration.capture.trial_warnings import TrialWarnings
+from dlo_calibration.capture.trials import Drafter, Drafts, TrialDraft, write_request, write_session
 from dlo_calibration.errors import InputError, suggestion
 from dlo_calibration.evaluation.digest import digest
 from dlo_calibration.files.chain_file import chain_csv, chain_xml
+from dlo_calibration.files.result import read_description
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.page.calibration import ProjectCalibration
 from dlo_calibration.page.film import film, film_motion
+from dlo_calibration.page.filming import FilmRoom
 from dlo_calibration.page.graph import PageGraph
 from dlo_calibration.page.information import Information
 from dlo_calibration.simulation.motion import Motion
+from dlo_calibration.vision.observer import jpeg_of
 from dlo_calibration.vision.photograph import jpeg, png
-from dlo_calibration.workspace.folder import FILES, REQUEST, SESSION
+from dlo_calibration.workspace.check import checked
+from dlo_calibration.workspace.folder import FILES, REQUEST, RESULT, SESSION
+from dlo_calibration.workspace.source import read_source, Selection
 from dlo_calibration.writing import make_folder, write_file
 
 MOST_FILMS = 8  # in memory
@@ -56,6 +63,7 @@ class Studio:
         self._calibration = ProjectCalibration(project.folder, make_simulator, options)
         self._films: dict[str, Motion] = {}  # the newest last
         self._film_lock = threading.Lock()
+        self._film_room = FilmRoom(project)
         self._fresh: list[str] = []  # ids of photographs whose tracers are not prepared yet
         self._newest: Drafts | None = None
 
@@ -71,6 +79,8 @@ class Studio:
                     'photographs': drafts['photographs'], 'trials': trials, 'obstacles': drafts['obstacles'],
                     'calibration': {**self.calibration(),
                                     'result': self._calibration.plain_result(self._drafts.digest)},
+                    'films': {entry.id: self._film_room.plain(entry)
+                              for entry in self.project.document.films},
                     'lens': self.project.lens_name, 'ros': self._graph is not None,
                     'actions': described(), 'folder': str(self.project.folder),
                     'warnings': self.project.warnings}
@@ -104,6 +114,23 @@ class Studio:
             identity = self.project.add_photograph(octets, name)
             self._fresh.append(identity)
             return {'id': identity, 'state': self._changed()}
+
+    def new_film(self) -> Path:
+        """Return a path at which the content of a film can be written, for `add_film`."""
+        with self._lock:
+            return self.project.new_film()
+
+    def add_film(self, path: Path, name: str) -> dict[str, Any]:
+        """Take a film whose content was written; return its id and the state."""
+        with self._lock:
+            identity = self.project.add_film(path, name)
+            return {'id': identity, 'state': self._changed()}
+
+    def follow(self, identity: str) -> dict[str, Any]:
+        """Begin to follow the DLO through a film, and return the state."""
+        with self._lock:
+            self._film_room.follow(self._entry(identity).id)
+            return self.state()
 
     def set_lens(self, octets: bytes, name: str) -> dict[str, Any]:
         """Take a camera calibration, and return the state."""
@@ -144,6 +171,21 @@ class Studio:
 
     # The results
 
+    def check(self, octets: bytes, name: str) -> dict[str, Any]:
+        """
+        Return whether the trials still show the DLO of a result, and why, in sentences.
+
+        :param octets: the result file; `name` is only shown.
+        :raises InputError: if it cannot be read, or there is no complete trial.
+        """
+        file = read_description(octets, name or RESULT)
+        with self._lock:
+            self._information.pause()
+            session = self._write(SESSION, {})
+        source = read_source(Selection(session), lambda _: None, file.file_options).require_trials()
+        found = checked(file, source.trials, source.options, self._make_simulator)
+        return {'verdict': found.verdict, 'words': list(found.words)}
+
     def film(self, number: int, identity: str) -> dict[str, Any]:
         """
         Return the simulated motion of a trial, over a photograph, see `film`.
@@ -171,6 +213,34 @@ class Studio:
             if len(self._films) > MOST_FILMS:
                 del self._films[next(iter(self._films))]
         return film(trial, motion, scale)
+
+    def film_path(self, identity: str) -> Path:
+        """Return the file of a film."""
+        with self._lock:
+            return self.project.film_path(self._entry(identity).id)
+
+    def film_frame(self, identity: str, time: float) -> bytes:
+        """Return the first image of a film from a time [s] on, as a JPEG file."""
+        with self._lock:
+            shown = self._film_room.film(self._entry(identity).id)
+        frame = next(shown.frames(min(time, shown.duration - 1.0 / shown.frame_rate)), None)
+        if frame is None:
+            raise InputError('film', f'no image at {time:g} s', 'an earlier time', 'go back')
+        return jpeg_of(frame.pixels)
+
+    def film_line(self, identity: str) -> dict[str, Any]:
+        """Return where the DLO was seen in a film, see `FilmRoom.line`."""
+        with self._lock:
+            return self._film_room.line(self._entry(identity).id)
+
+    def film_simulated(self, identity: str) -> dict[str, Any]:
+        """Return the simulated DLO over a film, see `FilmRoom.simulated`."""
+        with self._lock:
+            entry, description = self._entry(identity), self._calibration.description
+        if description is None:
+            raise InputError('film', 'no result yet', 'a result', 'calibrate first')
+        with self._film_lock:  # one simulation at a time
+            return self._film_room.simulated(entry, description, self._make_simulator)
 
     def file(self, name: str) -> bytes:
         """
@@ -233,6 +303,12 @@ class Studio:
             if self._fresh:
                 with suppress(InputError):
                     self._drafter.prepare(self._fresh.pop(0))  # while the person looks at it
+            film_news = self._film_room.take()
+            if film_news == 'trials':
+                self._newest = None
+                news.append('state')
+            elif film_news:
+                news.append('films')
             if self._calibration.take():
                 news.append('calibration' if self._calibration.busy else 'state')
             if self._calibration.written.is_set():
@@ -241,6 +317,12 @@ class Studio:
             if not self._calibration.busy and self._information.take():
                 news.append('information')
             return tuple(dict.fromkeys(news))
+
+    def films(self) -> list[dict[str, Any]]:
+        """Return how far the following of each film is that is followed."""
+        with self._lock:
+            return [{'id': entry.id, 'progress': progress} for entry in self.project.document.films
+                    if (progress := self._film_room.progress(entry.id)) is not None]
 
     def information(self) -> list[dict[str, Any]]:
         """Return the information of each trial, as far as it is known, with its number from 0."""
@@ -252,6 +334,7 @@ class Studio:
         """End the background work; everything else is on the disk already."""
         with self._lock:
             self._information.close()
+            self._film_room.close()
             self._calibration.close()
             if self._graph is not None:
                 self._graph.close()
@@ -266,12 +349,34 @@ class Studio:
     def _drafts(self) -> Drafts:
         """The drafts of the present document, made at the first use."""
         if self._newest is None:
-            self._newest = self._drafter.draft()
+            self._newest = self._with_films(self._drafter.draft())
             trials = [draft.trial for draft in self._newest.trials if draft.trial is not None]
             with suppress(InputError):  # a calibration is refused with the reason
                 self._write_scene(self.project.folder)
             self._information.want(trials, self._options({}), digest(*self._newest.obstacles))
         return self._newest
+
+    def _with_films(self, drafts: Drafts) -> Drafts:
+        """Return drafts with the trials of the films behind those of the photographs."""
+        filmed = [TrialDraft(TrialWarnings(), trial=own.trial)
+                  for entry in self.project.document.films
+                  if (followed := self._film_room.followed.get(entry.id)) is not None
+                  for k, own in enumerate(followed.trials) if k not in entry.left_out]
+        first = len(drafts.trials)
+        named = [replace(draft, trial=draft.trial and replace(draft.trial, name=_name(first + k)))
+                 for k, draft in enumerate(filmed)]
+        return replace(drafts, trials=(*drafts.trials, *named), filmed_diameter=2.0 * self._film_room.radius or None)
+
+    def _entry(self, identity: str) -> FilmEntry:
+        """
+        Return a film of the document, given by its id.
+
+        :raises UnknownName: if it is not there.
+        """
+        entry = next((film for film in self.project.document.films if film.id == identity), None)
+        if entry is None:
+            raise UnknownName('film', identity, 'the id of a film of the project', 'load the page again')
+        return entry
 
     def _complete(self) -> tuple[Trial, ...]:
         """Return the complete trials."""

@@ -101,12 +101,19 @@ class Posterior:
 
     def draws(self, count: int, seed: int) -> list[dict[str, float]]:
         """Return physical values of all parameters, in SI units, at `count` draws with a random seed."""
+        physical = [self._physical(values) for values in self.drawn_values(count, seed)]
+        return [{**draw, 'self_collision': min(draw['self_collision'], self.thickest)} for draw in physical]
+
+    def drawn_values(self, count: int, seed: int) -> Floats:
+        """Return (count, d) values on the 0..100 scale, drawn with a random seed."""
+        normal = self.standard_draws(count, seed)
+        return np.clip(self.values + normal * np.where(normal < 0, self.below, self.above), 0.0, SCALE)
+
+    def standard_draws(self, count: int, seed: int) -> Floats:
+        """Return (count, d) standard normal draws with the correlations."""
         variances, axes = np.linalg.eigh(self.correlations)
         normal = np.random.default_rng(seed).standard_normal((count, len(self.values)))
-        normal = normal * np.sqrt(np.maximum(variances, 0)) @ axes.T
-        drawn = self.values + normal * np.where(normal < 0, self.below, self.above)
-        physical = [self._physical(values) for values in np.clip(drawn, 0.0, SCALE)]
-        return [{**draw, 'self_collision': min(draw['self_collision'], self.thickest)} for draw in physical]
+        return np.asarray(normal * np.sqrt(np.maximum(variances, 0)) @ axes.T)
 
     def _physical(self, values: Floats) -> dict[str, float]:
         named = dict(zip(self.space.free, map(float, values), strict=True))

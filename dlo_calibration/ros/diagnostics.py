@@ -143,3 +143,18 @@ def planner_status(types: MessageTypes, stamp: int, content: Mapping[str, Any], 
             'remarks': ' '.join(plan.warnings)})
     message = f'{state}: {content["detail"]}' if content['detail'] else state
     return _diagnostics(types, stamp, [(level, 'status', message, values)])
+
+
+TRACKING, LOST, STOPPED = 'tracking', 'lost', 'stopped'  # states of the tracker, besides WAITING and FAILED
+
+
+def tracker_status(types: MessageTypes, stamp: int, content: Mapping[str, Any]) -> Any:
+    """
+    Build the message about what the tracker sees.
+
+    :param content: values, among them the state and, perhaps empty, a detail about it.
+    """
+    state = content['state']
+    level = ERROR if state == FAILED else WARN if state == LOST else OK
+    message = f'{state}: {content["detail"]}' if content['detail'] else state
+    return _diagnostics(types, stamp, [(level, 'status', message, content)])

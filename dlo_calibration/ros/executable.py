@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The executables `calibrator` and `planner`: each installs its signal handlers before it loads ROS."""
+"""The executables of the nodes: each installs its signal handlers before it loads ROS."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ PROGRAMS = {
                    'Calibrates a deformable linear object from messages.'),
     'planner': ('dlo_calibration.ros.planner_node', 'PlannerNode',
                 'Plans actions that bring a calibrated deformable linear object to a goal.'),
+    'tracker': ('dlo_calibration.ros.tracker_node', 'TrackerNode',
+                'Follows a deformable linear object, and hands with tags, in the images of a camera.'),
 }
 
 
@@ -29,6 +31,11 @@ def calibrator() -> int:
 def planner() -> int:
     """Run the planner with the command line of the process, as `execute` does."""
     return execute('planner', sys.argv[1:])
+
+
+def tracker() -> int:
+    """Run the tracker with the command line of the process, as `execute` does."""
+    return execute('tracker', sys.argv[1:])
 
 
 def execute(program: str, args: Sequence[str]) -> int:

@@ -66,6 +66,64 @@ def node_and_rviz(file: str, node: str, *, parameters: Mapping[str, str], topics
     ])
 
 
+#: Topic of the calibrator -> topic of the tracker, of what a camera sees of trials.
+SEEN = {'initial_chain': 'initial_chain', 'action': 'action', 'goal_chain': 'chain'}
+
+
+def tracker_and_calibrator(file: str) -> Any:
+    """
+    Return a LaunchDescription of the tracker, of a calibrator that hears it, and of RViz if wanted.
+
+    :param file: the launch file.
+    :raises InputError: for an unknown argument, or where RViz is wanted and not installed.
+    """
+    from ament_index_python.packages import get_package_share_directory
+    from launch import LaunchDescription
+    from launch.actions import DeclareLaunchArgument, OpaqueFunction
+    from launch.conditions import IfCondition
+    from launch.substitutions import LaunchConfiguration
+    from launch_ros.actions import Node
+
+    config = Path(get_package_share_directory('dlo_calibration')) / 'config'
+    arguments = {
+        'params_file': (str(config / 'tracker.yaml'),
+                        'parameters of the tracker; copy the default and change the copy'),
+        'points': ('', 'rough clicks along the DLO in the first image; empty: as the parameter file says'),
+        'image': ('', "topic of the images, uncompressed; empty: the tracker's own"),
+        'compressed': ('', "topic of the images, compressed; empty: the tracker's own"),
+        'camera_info': ('', "topic of the camera's calibration; empty: the tracker's own"),
+        'depth': ('', "topic of the aligned depth; empty: the tracker's own"),
+        'mass': ('', 'mass of the whole DLO [kg]; empty: unknown'),
+        'frame': ('table', 'frame_id of the chains'),
+    }
+    check_arguments(file, (*arguments, 'rviz'))
+
+    def start(context: Any) -> list[Any]:
+        value = {name: LaunchConfiguration(name).perform(context) for name in (*arguments, 'rviz')}
+        check_rviz(value['rviz'])
+        topics = {'image': value['image'], 'image/compressed': value['compressed'],
+                  'camera_info': value['camera_info'], 'depth': value['depth']}
+        return [
+            Node(package='dlo_calibration', executable='tracker', name='tracker', output='screen',
+                 ros_arguments=['--params-file', LaunchConfiguration('params_file'),
+                                *flags({'points': value['points'], 'frame_id': value['frame']}, topics)]),
+            Node(package='dlo_calibration', executable='calibrator', name='calibrator', output='screen',
+                 ros_arguments=['--params-file', str(config / 'calibrator.yaml'), *flags(
+                     {'mass': value['mass']}, {name: f'/tracker/{of}' for name, of in SEEN.items()})]),
+            Node(package='rviz2', executable='rviz2', name='rviz2',
+                 arguments=['-d', str(config / 'tracker.rviz'), '-f', LaunchConfiguration('frame')],
+                 condition=IfCondition(LaunchConfiguration('rviz'))),
+        ]
+
+    return LaunchDescription([
+        *(DeclareLaunchArgument(name, default_value=default, description=description)
+          for name, (default, description) in arguments.items()),
+        DeclareLaunchArgument('rviz', default_value='false', choices=['true', 'false'],
+                              description='start RViz too (the package rviz2)'),
+        OpaqueFunction(function=start),
+    ])
+
+
 def check_arguments(file: str, known: Sequence[str], words: Sequence[str] | None = None) -> None:
     """
     Check the arguments of ``ros2 launch``, which itself ignores those that it does not know.

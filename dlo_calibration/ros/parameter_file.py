@@ -2,12 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Parameter file: ``config/calibrator.yaml`` or ``config/planner.yaml``, every parameter with a comment.
+Parameter file: ``config/calibrator.yaml`` or that of another node, every parameter with a comment.
 
 The files are generated from the declarations of the options. When one of them changes, generate them again:
 
     python -m dlo_calibration.ros.parameter_file calibrator > config/calibrator.yaml
     python -m dlo_calibration.ros.parameter_file planner > config/planner.yaml
+    python -m dlo_calibration.ros.parameter_file tracker > config/tracker.yaml
 """
 
 from __future__ import annotations
@@ -19,11 +20,13 @@ from typing import Mapping
 
 from dlo_calibration.calibration.options import Declaration, DeclaredOptions, Options
 from dlo_calibration.ros.planner_session import PlannerOptions
+from dlo_calibration.ros.tracker_session import TrackerOptions
 
 NO_TEXTS = ['']  # an empty list of texts as a parameter: ROS cannot distinguish it from other empty lists
 
 #: name of a node -> its options
-NODES: Mapping[str, type[DeclaredOptions]] = {'calibrator': Options, 'planner': PlannerOptions}
+NODES: Mapping[str, type[DeclaredOptions]] = {
+    'calibrator': Options, 'planner': PlannerOptions, 'tracker': TrackerOptions}
 
 HEAD = """\
 All parameters of the node {node}, with their defaults.  To change some, copy this file, edit the copy

@@ -7,7 +7,7 @@ Board: a ChArUco board, which is printed, laid beside the DLO, and found in the 
 Its frame: the origin is the lower left corner of the squares, x goes along the paper's short side to the
 right, y along the long side upwards, z up from the paper.  Of OpenCV, only the markers and their corners
 are used: the order of a board's corners, its origin and its colours differ between its versions.
-The sheet is a PDF document, to be printed at its true size.
+The sheet is a PDF document, to be printed at its true size; its second page has tags to cut out.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ import numpy as np
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.vision.photograph import Pixels
+from dlo_calibration.vision.tags import QUIET, TAG_CELLS, tag_cells, TAG_SIDE, TAGS
 from dlo_calibration.writing import write_file
 
 COLUMNS, ROWS = 7, 9  # squares; those in the corners are black
@@ -43,6 +44,7 @@ _ARUCO: Any = cv2.aruco  # of any version
 INCH = 0.0254  # m
 BOTTOM = 0.040  # m, from the lower edge of the paper to the squares: room for the ruler line
 ARROW = 0.012  # m
+TAGS_IN_A_ROW, TAG_PITCH = 4, 0.04  # of the second page; m from tag to tag
 DARK = 'black'
 
 
@@ -225,27 +227,61 @@ def write_board(path: Path, paper: str = 'a4') -> None:
 
 
 def board_document(paper: str = 'a4') -> bytes:
-    """Return the PDF document of the board for a size of paper."""
+    """Return the PDF document of the board, and of tags to cut out, for a size of paper."""
+    from matplotlib.backends.backend_pdf import PdfPages
+
     stream = io.BytesIO()
-    board_figure(paper).savefig(stream, format='pdf', metadata={
-        'CreationDate': None, 'Title': f'Board for {PAPERS[paper].name}'})
+    metadata = {'CreationDate': None, 'Title': f'Board for {PAPERS[paper].name}'}
+    with PdfPages(stream, metadata=metadata) as pages:
+        for figure in (board_figure(paper), tags_figure(paper)):
+            pages.savefig(figure)
     return stream.getvalue()
 
 
 def board_figure(paper: str = 'a4') -> Any:
     """Return the board as a figure of Matplotlib, with the size of the paper."""
-    from matplotlib.figure import Figure
-
     sheet = PAPERS[paper]
-    figure = Figure(figsize=(sheet.width / INCH, sheet.height / INCH))
-    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    axes.set(xlim=(0.0, sheet.width), ylim=(0.0, sheet.height))  # m on the paper
-    axes.set_axis_off()
+    figure, axes = _blank(sheet)
     left = (sheet.width - COLUMNS * SQUARE) / 2.0
     _draw_squares(axes, sheet, left, BOTTOM)
     _draw_frame(axes, left, BOTTOM)
     _draw_ruler(axes, sheet)
     return figure
+
+
+def tags_figure(paper: str = 'a4') -> Any:
+    """Return the tags to cut out, as a figure of Matplotlib with the size of the paper."""
+    sheet = PAPERS[paper]
+    figure, axes = _blank(sheet)
+    side, cell = TAG_SIDE + 2.0 * QUIET, TAG_SIDE / TAG_CELLS
+    for number in range(TAGS):
+        row, column = divmod(number, TAGS_IN_A_ROW)
+        left = sheet.width / 2.0 + (column - TAGS_IN_A_ROW / 2.0) * TAG_PITCH + (TAG_PITCH - side) / 2.0
+        bottom = sheet.height - 0.06 - row * TAG_PITCH
+        axes.plot(left + side * np.array([0, 1, 1, 0, 0]), bottom + side * np.array([0, 0, 1, 1, 0]),
+                  color='0.6', lw=0.4)  # where to cut
+        x, y = left + QUIET, bottom + QUIET
+        _fill(axes, [(x, y, TAG_SIDE)], DARK)
+        _fill(axes, [(x + across * cell, y + TAG_SIDE - (down + 1) * cell, cell)
+                     for down, across in np.argwhere(tag_cells(number))], 'white')
+        axes.text(left + side / 2.0, bottom - 0.004, f'hand_{number + 1}', ha='center', va='center',
+                  fontsize=9)
+    axes.text(sheet.width / 2.0, sheet.height - 0.06 - 2.0 * TAG_PITCH + 0.02,
+              'Cut out along the grey lines.  Glue each tag flat on what holds the DLO: a clothes peg, a\n'
+              'pair of tongs, a finger of a robot, so that the camera sees it while the hand moves.',
+              ha='center', va='top', fontsize=9)
+    return figure
+
+
+def _blank(sheet: Paper) -> tuple[Any, Any]:
+    """Return a figure of Matplotlib with the size of a paper, and axes in metres on the paper."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(sheet.width / INCH, sheet.height / INCH))
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.set(xlim=(0.0, sheet.width), ylim=(0.0, sheet.height))
+    axes.set_axis_off()
+    return figure, axes
 
 
 def _draw_squares(axes: Any, sheet: Paper, left: float, bottom: float) -> None:

@@ -131,10 +131,16 @@ def read_lens(path: Path) -> Lens:
     except Exception as error:  # damaged YAML can raise anything
         raise InputError(thing, 'another kind of file', EXPECTED,
                          'name the file that the calibration wrote') from error
-    return _lens(document, thing)
+    return lens_of(document, thing)
 
 
-def _lens(document: dict[str, Any], thing: str) -> Lens:
+def lens_of(document: dict[str, Any], thing: str) -> Lens:
+    """
+    Return the lens of a camera calibration's entries, named as in its YAML or in sensor_msgs/CameraInfo.
+
+    :param thing: what it is called in errors.
+    :raises InputError: where they are not those of a camera.
+    """
     size = (_numbers(document, thing, ('image_width', 'width'), (1,)),
             _numbers(document, thing, ('image_height', 'height'), (1,)))
     width, height = (int(side[0]) for side in size)

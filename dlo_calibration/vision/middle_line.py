@@ -102,7 +102,7 @@ def fit(pixels: NDArray[np.uint8], rough: Floats, width: float, beyond: float) -
         strength = edges(strip, along * (0.6 if iteration == 0 else 1.0))
         table = learn_colours(strip, 0.75, (1.5, 2.4))
         colours = gaussian_filter1d(odds(table, strip.lab), along / 2, axis=0)
-        index = best_columns(_scores(strip, _evidence(strip, strength, colours), 1.0)[None], DRIFT)[0][0]
+        index = best_columns(scores_of(strip, evidence_of(strip, strength, colours), 1.0)[None], DRIFT)[0][0]
         if iteration < ITERATIONS - 1:
             halves = halves * _width_ratios(strip, strength, index)
             line = smoothed(strip.at(strip.offsets[index]), along)
@@ -159,15 +159,15 @@ def _first_fit(pixels: NDArray[np.uint8], line: Floats, width: float) -> tuple[F
     table = learn_colours(strip, 0.2, (1.2, reach))
     colours = gaussian_filter1d(odds(table, strip.lab), 0.3 * width / spacing, axis=0)
     colours *= np.float32(FIRST_COLOUR / COLOUR)
-    evidence = _evidence(strip, strength, colours)
-    indices, means = best_columns(np.stack([_scores(strip, evidence, half) for half in HALVES]), DRIFT)
+    evidence = evidence_of(strip, strength, colours)
+    indices, means = best_columns(np.stack([scores_of(strip, evidence, half) for half in HALVES]), DRIFT)
     best = int(np.argmax(means))
     index = indices[best]
     half = float(HALVES[best]) * width
     return smoothed(strip.at(strip.offsets[index]), half / spacing), half
 
 
-def _evidence(strip: Strip, strength: Singles, colours: Singles) -> tuple[Singles, Singles]:
+def evidence_of(strip: Strip, strength: Singles, colours: Singles) -> tuple[Singles, Singles]:
     """Return the strength of edges (n, m), at most 1, and the sums of colours across (n, m + 1)."""
     # An edge counts fully from a share of the usual one on.
     saturated = np.minimum(strength / max(FULL * _usual(strip, strength), 1e-6), 1)
@@ -175,7 +175,7 @@ def _evidence(strip: Strip, strength: Singles, colours: Singles) -> tuple[Single
         [np.zeros((len(colours), 1), np.float32), np.cumsum(colours, axis=1)], axis=1)
 
 
-def _scores(strip: Strip, evidence: tuple[Singles, Singles], half: float) -> Singles:
+def scores_of(strip: Strip, evidence: tuple[Singles, Singles], half: float) -> Singles:
     """Return how well each offset (n, m) fits as the middle of a DLO with a half width."""
     saturated, sums = evidence
     step = strip.offsets[1] - strip.offsets[0]
@@ -204,7 +204,7 @@ def _usual(strip: Strip, strength: Singles) -> float:
     return float(np.median(strength[:, near].max(axis=1)))
 
 
-def _sides(strip: Strip, strength: Singles, index: NDArray[np.int64],
+def sides_of(strip: Strip, strength: Singles, index: NDArray[np.int64],
            half: float | Floats = 1.0) -> tuple[Floats, Floats]:
     """Return the offsets (2, n) of both edges near the half widths, and their strength (2, n), 1 is usual."""
     usual = max(_usual(strip, strength), 1e-6)
@@ -224,7 +224,7 @@ def _sides(strip: Strip, strength: Singles, index: NDArray[np.int64],
 
 def _width_ratios(strip: Strip, strength: Singles, index: NDArray[np.int64]) -> Floats:
     """Return the ratio (n,) of the edges' distance to the strip's width; its logarithm is linear in place."""
-    (left, right), strengths = _sides(strip, strength, index)
+    (left, right), strengths = sides_of(strip, strength, index)
     ratio = np.log(np.clip((right - left) / 2, 0.6, 1.6))
     place = strip.line - strip.line.mean(axis=0)
     terms = np.column_stack([np.ones(len(place)), place / max(float(np.abs(place).max()), 1.0)])
@@ -243,7 +243,7 @@ def _last_fit(strip: Strip, strength: Singles, colours: Singles, index: NDArray[
     """Locate both edges between the offsets, and smooth the middle where they are weak."""
     half = np.ones(len(index))
     for _ in range(2):
-        (left, right), (left_strength, right_strength) = _sides(strip, strength, index, half)
+        (left, right), (left_strength, right_strength) = sides_of(strip, strength, index, half)
         # A rope's width varies; without evidence it is the strip's.
         trust = np.minimum(left_strength, right_strength) ** 2
         widths, trusts = (gaussian_filter1d(values, LOCAL * along, mode='nearest') + UNSEEN
@@ -258,7 +258,7 @@ def _last_fit(strip: Strip, strength: Singles, colours: Singles, index: NDArray[
     # In a shadow, the edge of the colours is clearer than that of the brightness.
     smooth = gaussian_filter1d(gaussian_filter1d(odds(table, strip.lab), along, axis=0), 1.0, axis=1)
     changes = np.abs(np.gradient(smooth, axis=1)).astype(np.float32)
-    (left_seen, right_seen) = _sides(strip, changes, index, half)[1]
+    (left_seen, right_seen) = sides_of(strip, changes, index, half)[1]
     both = np.minimum(np.maximum(left_strength, left_seen), np.maximum(right_strength, right_seen))
     quality = np.clip(1.4 * both, 0, 1) * agrees * np.clip((inside - LEAST) / 1.2, 0, 1)
     weight = 1e-4 + quality
@@ -406,7 +406,7 @@ def between_ends(pixels: NDArray[np.uint8], middle: Middle, clicks: Floats, near
     for order in (1, -1):
         way = line[::order]
         arc = arc_lengths(way)
-        end = _end(arc, middle.inside[::order], _arc_at(way, arc, clicks[::order][0]), near)
+        end = end_near(arc, middle.inside[::order], _arc_at(way, arc, clicks[::order][0]), near)
         if end is not None:
             line = _extended(way, arc, end, half)[::order]
     line = _bridged(line, sure, middle.inside, clicks, 2 * half)
@@ -419,8 +419,8 @@ def between_ends(pixels: NDArray[np.uint8], middle: Middle, clicks: Floats, near
         way = evenly(way[:int(np.searchsorted(arc, click + near)) + 2], END_STEP * half)
         arc = arc_lengths(way)
         part = straighten(pixels, way, np.full(len(way), half), np.linspace(-0.25, 0.25, 9))
-        end = _end(arc, odds(middle.table, part.lab).mean(axis=1), click, near)
-        end = click if end is None else _edge(arc, part, end, EDGE * half)
+        end = end_near(arc, odds(middle.table, part.lab).mean(axis=1), click, near)
+        end = click if end is None else edge_near(arc, part, end, EDGE * half)
         ends.append(float(end if order == 1 else whole - end))
     arc = arc_lengths(line)
     if ends[1] - ends[0] < 2 * spacing:
@@ -448,7 +448,7 @@ def gaps(sure: NDArray[np.bool_]) -> list[tuple[int, int]]:
     return [(part.start, part.stop) for part, in find_objects(label(~sure)[0])]
 
 
-def _end(arc: Floats, inside: Floats, click: float, near: float) -> float | None:
+def end_near(arc: Floats, inside: Floats, click: float, near: float) -> float | None:
     """
     Return the arc length [px] at which the DLO begins near a click; None if it begins elsewhere.
 
@@ -464,7 +464,7 @@ def _end(arc: Floats, inside: Floats, click: float, near: float) -> float | None
     return float(arc[window[first]] + arc[window[first - 1]]) / 2
 
 
-def _edge(arc: Floats, part: Strip, near: float, reach: float) -> float:
+def edge_near(arc: Floats, part: Strip, near: float, reach: float) -> float:
     """Return the arc length [px] of the strongest change of colour along a strip near `near`."""
     colour = gaussian_filter1d(part.lab.mean(axis=1), 1.0, axis=0)
     change = np.linalg.norm(np.diff(colour, axis=0), axis=1)

@@ -6,7 +6,7 @@ A calibration under way and its folder; command line, node and capture page are 
 
 `source` reads a session or a request, `worker` calibrates in a thread, and `folder` has the input and the log
 of a calibration until its result is complete, then the files of the result; `validation` tries a result on
-other trials.
+other trials, and `check` tells whether they show the same DLO.
 """
 
 from dlo_calibration.workspace.folder import CalibrationFolder

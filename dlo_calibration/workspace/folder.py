@@ -259,6 +259,8 @@ def write_values(attempts: Attempts, result: CalibrationResult, options: Options
 
 def _recorded(path: Path) -> list[Path]:
     """List the files that hold the messages of a session."""
+    if not path.exists():  # several sessions were calibrated together
+        return []
     return [path] if path.is_file() else sorted(file for file in path.iterdir()
                                                 if file.suffix in ('.mcap', '.db3', '.zstd'))
 
@@ -270,7 +272,7 @@ def _write_session(source: Source, path: Path) -> None:
     A session with remapped topics is written with the inputs alone, under the names of the calibrator; a
     request becomes the messages that a robot would have sent.
     """
-    files = [source.path] if source.path.is_file() else sorted(source.path.glob('*.mcap'))
+    files = [source.path] if source.path.is_file() else sorted(source.path.glob('*.mcap'))  # none: of several
     remapped = source.session.remapped
     if len(files) == 1 and files[0].suffix == '.mcap' and not remapped:
         _copy(files[0], path)

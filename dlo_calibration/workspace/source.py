@@ -9,11 +9,19 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Callable, Mapping, Sequence
 
+import numpy as np
+
 from dlo_calibration.calibration.choice import hand_warnings
 from dlo_calibration.calibration.options import FileOptions, names_of, OBSERVATION, Options
 from dlo_calibration.errors import DloCalibrationError, InputError
 from dlo_calibration.files.request import read_request, Request, request_manipulations, request_trials
-from dlo_calibration.files.session import read_session, Session, session_manipulations, session_trials
+from dlo_calibration.files.session import (
+    read_session,
+    Session,
+    session_manipulations,
+    session_trials,
+    trial_records,
+)
 from dlo_calibration.model.named_actions import Manipulation
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.grips import GripEvidence
@@ -121,21 +129,79 @@ def read_source(selection: Selection, warn: Callable[[str], None], of_result: Fi
     :param any_topics: read a session without any topic of the calibrator, too.
     :raises InputError: if it cannot be read, an option has a bad value, or a trial to leave out is missing.
     """
-    source = _read(selection, warn, of_result, any_topics)
-    options = source.options
+    return _with_trials(_read(selection, warn, of_result, any_topics), warn)
+
+
+def _with_trials(source: Source, warn: Callable[[str], None]) -> Source:
+    """Return a source with its trials, those that are left out excepted."""
+    options, without = source.options, source.selection.without
     notes: list[str] = []
     trials, refusals = session_trials(source.session, options, notes.append) if source.request is None else \
         request_trials(source.request, options)
     for text in (*source.warnings, *notes, *(refusals if trials or source.request is None else ())):
         warn(text)  # if no trial of a request can be used, `require_trials` says why
-    numbers = _numbers(selection.without, [trial.name for trial in trials], warn)
-    used = tuple(trials[number - 1] for number in numbers)
+    numbers = _numbers(without, [trial.name for trial in trials], warn)
+    used = tuple(_in_sessions(trials, options)[number - 1] for number in numbers)
     implausible = implausible_trials(used, options.table_top, bool(options.scene))
     source = replace(source, trials=used, refusals=refusals, notes=tuple(notes), numbers=numbers,
                      implausible=implausible, evidence=GripEvidence.of(used))
     for text in source.trial_warnings:
         warn(text)
     return source
+
+
+def _in_sessions(trials: Sequence[Trial], options: Options) -> Sequence[Trial]:
+    """
+    Return trials with the numbers of their sessions.
+
+    :raises InputError: if there are other trials than the options say.
+    """
+    counts = options.trials_of_sessions
+    if not counts or not trials:
+        return trials
+    if sum(counts) != len(trials):
+        raise InputError('parameter sessions', f'{options.sessions}, which are {sum(counts)} trials',
+                         f'numbers that add up to {len(trials)}, the trials that there are', 'correct it')
+    sessions = np.repeat(np.arange(1, len(counts) + 1), counts).tolist()
+    return [replace(trial, session=session) for trial, session in zip(trials, sessions, strict=True)]
+
+
+def read_sources(selections: Sequence[Selection], warn: Callable[[str], None]) -> Source:
+    """
+    Read one or several sessions or requests of the same DLO; the trials of several become one session.
+
+    The first gives the options of the search.
+
+    :raises InputError: as `read_source` does; or if sessions were observed differently, or are too many.
+    """
+    if len(selections) == 1:
+        return read_source(selections[0], warn)
+    sources = [read_source(replace(selection, without=()), warn).require_trials() for selection in selections]
+    first = sources[0]
+    for other in sources[1:]:
+        _require_same_observation(first, other)
+    # As the files of the result hold them, so that these give the same numbers.
+    records = trial_records([trial for source in sources for trial in source.trials])
+    options = {**first.options.flat(), 'sessions': ' '.join(str(len(source.trials)) for source in sources)}
+    path = first.path.with_name('+'.join(source.path.name for source in sources))
+    session = Session(path, records, records, FileOptions(options))
+    merged = Source(replace(selections[0], path=path), session, None, Options.of(options), (), None)
+    return _with_trials(merged, warn)
+
+
+def _require_same_observation(first: Source, other: Source) -> None:
+    """
+    Check that two sessions can be simulated with the same options.
+
+    :raises InputError: if they were observed differently.
+    """
+    names = [name for name in names_of(OBSERVATION) if name != 'sessions']
+    for name in names:
+        before, now = first.options.flat()[name], other.options.flat()[name]
+        if before != now:
+            raise InputError(f'session {other.path}', f'{name} {_text(now)}',
+                             f'{_text(before)}, as in {first.path.name}',
+                             f'give one value for both, e.g. --{name.replace("_", "-")}, or fit them alone')
 
 
 def read_manipulations(selection: Selection, warn: Callable[[str], None], of_result: FileOptions
@@ -178,7 +244,8 @@ def _read(selection: Selection, warn: Callable[[str], None], of_result: FileOpti
         observed = {name: value for name, value in recorded.items() if name in names_of(OBSERVATION)}
         if 'scene' not in observed:
             refusal = refusal or of_result.refusal
-        recorded, warnings = {**of_result.values, **observed}, (*of_result.warnings, *warnings)
+        of_dlo = {name: value for name, value in of_result.values.items() if name != 'sessions'}
+        recorded, warnings = {**of_dlo, **observed}, (*of_result.warnings, *warnings)
     options = Options.of({**recorded, **selection.options})
     for name in selection.options:
         value = options.flat()[name]

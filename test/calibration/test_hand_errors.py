@@ -68,6 +68,7 @@ def test_late_and_shifted_hands_come_back_within_their_intervals():
             or wrong.parameters[name].lower <= right.values[name] <= wrong.parameters[name].upper, name
 
 
+@pytest.mark.long
 def test_hands_that_are_right_cost_the_other_intervals_little():
     right, wider = fit(), fit((*PHYSICS, *HANDS[:3]))
     for name in HANDS[:3]:

@@ -136,7 +136,10 @@ def values(declaration):
         return st.floats(declaration.minimum, declaration.maximum)
     if kind is tuple:
         names = [choice for choice in declaration.choices if choice != 'auto']
-        return st.lists(st.sampled_from(names), min_size=1, unique=True) | st.just(['auto'])
+        some = st.lists(st.sampled_from(names), min_size=1, unique=True)
+        return some | st.just(['auto']) if 'auto' in declaration.choices else some
+    if declaration.name == 'sessions':
+        return st.sampled_from(['', '4', '4 3'])
     if declaration.name == 'frame_pose':
         return st.sampled_from(['', '0 0 -0.75 0 0 0 1', '0.1 0.2 1.5 1.0 0 0 0'])
     return st.sampled_from(declaration.choices) if declaration.choices else st.text()

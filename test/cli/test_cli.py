@@ -213,6 +213,19 @@ def test_validate_simulates_the_result_and_fits_nothing(run, session, tmp_path):
     assert (printed['evaluations'], printed['simulations']) == (1, 2)
 
 
+def test_check_says_that_the_same_session_agrees(run, session, tmp_path):
+    run('fit', session, '--output', tmp_path / 'out')
+    code, output, _ = run('check', tmp_path / 'out' / 'result.xml', session, '--json')
+    printed = only_json(output)
+    assert code == 0
+    assert printed['verdict'] in ('agrees', 'cannot tell')
+    assert 0 < printed['probability_of_agreement'] <= 1
+    assert set(printed['parameters']['flexibility']) >= {'value', 'change', 'lower', 'upper', 'changed'}
+    assert printed['mean_error_m'] >= 0
+    words = run('check', tmp_path / 'out' / 'result.xml', session)[1]
+    assert words.startswith(('Agrees.', 'Cannot tell.'))
+
+
 def test_validate_on_another_session_uses_the_results_parameters(run, session, tmp_path):
     run('fit', session, '--output', tmp_path / 'out')
     other = write_session(tmp_path / 'other.mcap', session_messages(TYPES, 1, first=4), {'seed': 5})
@@ -296,7 +309,7 @@ def test_session_without_complete_trial_is_refused_by_fit_and_described_by_info(
     ['fit', 'SESSION', '--mass', '-1'], ['fit', 'SESSION', '--search', 'magic'],
     ['fit', 'SESSION', '--calibrate', 'colour'], ['fit', 'SESSION', '--calibrate', 'friction,friction'],
     ['fit', 'SESSION', '--evaluations', '-1'], ['fit', 'nowhere'], ['info', 'nowhere'], ['info', 'TEXT'],
-    ['validate', 'nowhere', 'SESSION'], ['validate', 'TEXT', 'SESSION'],
+    ['validate', 'nowhere', 'SESSION'], ['check', 'TEXT', 'SESSION'], ['validate', 'TEXT', 'SESSION'],
     ['fit', 'SESSION', '--output', 'TEXT'], ['fit', 'SESSION', '--eval', '3'],
 ], ids=' '.join)
 @pytest.mark.parametrize('as_json', [False, True], ids=['', 'json'])

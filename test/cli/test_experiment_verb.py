@@ -125,6 +125,7 @@ def test_finished_calibrations_are_not_repeated_and_more_runs_are_added(run, ses
     assert len(journal.read_bytes().splitlines()) == 12
 
 
+@pytest.mark.long
 def test_another_session_or_option_in_the_same_folder_is_not_mixed_up(run, session, tmp_path, undrawn):
     other = write_session(tmp_path / 'other' / 'rope.mcap', session_messages(bag_types(), 3, first=2),
                           {'mass': 0.1})

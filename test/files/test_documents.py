@@ -18,8 +18,9 @@ from dlo_calibration.cli.arguments import PREFIX
 from dlo_calibration.files.result import read_result
 from dlo_calibration.messages.codec import OUTPUT_TYPES
 from dlo_calibration.planning.plan import plain_plan
-from dlo_calibration.ros import planner_session
+from dlo_calibration.ros import planner_session, tracker_session
 from dlo_calibration.ros.planner_session import PlannerOptions
+from dlo_calibration.ros.tracker_session import TrackerOptions
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -37,8 +38,8 @@ def sections():
 
 
 @pytest.mark.parametrize('heading, declared', [
-    ('Parameters', Options.declarations()), ('The planner', PlannerOptions.declarations())],
-    ids=['calibrator', 'planner'])
+    ('Parameters', Options.declarations()), ('The planner', PlannerOptions.declarations()),
+    ('The tracker', TrackerOptions.declarations())], ids=['calibrator', 'planner', 'tracker'])
 def test_every_parameter_is_documented_as_it_is_declared(heading, declared):
     row = re.compile(r'^\| `(\w+)` \| (.*?) \| (.*?) \| (.*?) \| (.*?) \|$', re.MULTILINE)
     table = {name: rest for name, *rest in row.findall(sections()[heading])}
@@ -61,7 +62,11 @@ def test_every_topic_is_documented():
     planner = sections()['The planner']
     for name in (*planner_session.INPUT_TYPES, *planner_session.OUTPUT_TYPES, 'plan', 'stop'):
         assert f'~/{name}' in planner
-    calibrator = ''.join(text for heading, text in sections().items() if heading != 'The planner')
+    tracker = sections()['The tracker']
+    for name in (*tracker_session.INPUT_TYPES, *tracker_session.OUTPUT_TYPES, 'start', 'stop'):
+        assert f'~/{name}' in tracker
+    calibrator = ''.join(text for heading, text in sections().items()
+                         if heading not in ('The planner', 'The tracker'))
     for name in ('initial_chain', 'action', 'goal_chain', *OUTPUT_TYPES,
                  'start', 'stop', 'reset', 'discard_last'):
         assert f'~/{name}' in calibrator

@@ -395,7 +395,9 @@ def test_other_samples_are_descriptions():
     assert read_result(SAMPLES / 'dlo.xml').parameters['flexibility'].identifiable
 
 
-@pytest.mark.parametrize('file', REQUESTS, ids=lambda file: file.name)
+@pytest.mark.parametrize('file', [
+    pytest.param(file, marks=pytest.mark.long if file.stem == 'push_and_release' else (), id=file.name)
+    for file in REQUESTS])
 def test_sample_is_explained_by_its_parameters(file, capsys):
     code = cli.main(['validate', str(SAMPLES / 'dlo.xml'), str(file), '--json', '--workers', '1'])
     printed = json.loads(capsys.readouterr().out)

@@ -194,7 +194,8 @@ def test_a_chaotic_trial_of_a_known_rope_is_named_and_the_result_is_usable():
 
 @pytest.mark.parametrize('wrong', [
     pytest.param(lambda: coiled(5, damping=65.0), id='drag', marks=pytest.mark.long),
-    pytest.param(lambda: carried(5, 0, (-0.25, 0.2), 2.0, flexibility=85.0), id='another rope')])
+    pytest.param(lambda: carried(5, 0, (-0.25, 0.2), 2.0, flexibility=85.0), id='another rope',
+                 marks=pytest.mark.long)])
 def test_a_trial_that_went_wrong_is_not_sensitive_though_the_hand_holds_the_rope(wrong):
     result = known_rope(wrong())
     assert GripEvidence.of(result.trials).losses == ()

@@ -197,6 +197,16 @@ def test_a_calibration_can_be_stopped_and_gives_the_best_so_far(tmp_path):
         assert state['calibration']['result']['evaluations'] < 100000
 
 
+def test_trials_are_compared_with_an_earlier_result(finished):
+    page, folder, _ = finished
+    octets = (folder / 'result' / 'result.xml').read_bytes()
+    answer = page.done('POST', 'api/check', octets, {'X-Name': 'old.xml'})
+    assert answer['verdict'] in ('agrees', 'changed', 'cannot tell')
+    assert all(answer['words'])
+    assert 'old.xml' in page.refused('POST', 'api/check', octets[:300], {'X-Name': 'old.xml'})[1]
+    assert page.refused('POST', 'api/check', b'x' * 3_000_000)[0] == 413
+
+
 def test_a_calibration_that_fails_says_why(tmp_path):
     with served(tmp_path, simulator=lambda: ToySimulator(crash=True)) as page:
         whole_trial(page)

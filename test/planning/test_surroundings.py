@@ -140,6 +140,7 @@ def test_a_hand_goes_around_a_post_or_over_it_where_the_dlo_need_not(scene_of):
         assert distances(ways(result), place).min() >= CLEARANCE - 1e-5
 
 
+@pytest.mark.long
 def test_any_number_of_threads_finds_the_same_detour(scene_of):
     simulation = Options(scene=scene_of(post(*BETWEEN), post(0.3, -0.05)))
     single, double = (plan(DLO, straight(), GOAL, replace(ONE, workers=workers), simulation=simulation)

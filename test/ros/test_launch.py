@@ -21,7 +21,7 @@ from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.messages.codec import bag_types, INPUT_TYPES, OUTPUT_TYPES
 from dlo_calibration.model.parameters import PAPER_PARAMETERS
 from dlo_calibration.planning import PlanProgress
-from dlo_calibration.ros import diagnostics, launching, planner_session
+from dlo_calibration.ros import diagnostics, launching, planner_session, tracker_session
 from dlo_calibration.workspace.worker import Progress
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -102,6 +102,23 @@ def test_launch_passes_a_description_on(monkeypatch):
     started, = (entity for entity in launched('planner', monkeypatch, description='some/result.xml')
                 if entity.kind == 'Node' and entity.options['package'] == 'dlo_calibration')
     assert started.options['ros_arguments'][2:] == ['-p', 'description:=some/result.xml']
+
+
+def test_the_launch_file_of_the_tracker_starts_a_calibrator_that_hears_it(monkeypatch):
+    started = {entity.options['name']: entity.options for entity in launched(
+        'tracker', monkeypatch, image='/camera/image_raw', points='1,2 3,4', mass='0.03')
+        if entity.kind == 'Node'}
+    assert set(started) == {'tracker', 'calibrator', 'rviz2'}
+    assert 'condition' in started['rviz2']
+    words = started['tracker']['ros_arguments']
+    assert ['-r', '~/image:=/camera/image_raw'] == words[words.index('-r'):][:2]
+    assert 'points:=1,2 3,4' in words
+    heard = started['calibrator']['ros_arguments']
+    assert {'~/initial_chain:=/tracker/initial_chain', '~/action:=/tracker/action',
+            '~/goal_chain:=/tracker/chain', 'mass:=0.03'} <= set(heard)
+    shown = (ROOT / 'config' / 'tracker.rviz').read_text(encoding='utf-8')
+    assert {f'/tracker/{name}' for name in tracker_session.OUTPUT_TYPES} >= set(
+        re.findall(r'Value: (/tracker/.*)', shown))
 
 
 def test_launch_starts_rviz_only_where_it_is_asked_for(node, described):

@@ -28,7 +28,7 @@ def result():
     return calibrate(toy_trials(2), OPTIONS, make_simulator=new_toy)
 
 
-def test_each_page_has_slices_simulated_in_another_thread(result, tmp_path):
+def test_each_page_has_slices_simulated_in_another_thread(result, tmp_path, without_drawings):
     threads = []
     reporter = ReportWriter(lambda _: threads.append(threading.current_thread()) or ToySimulator())
     reporter.begin(tmp_path / 'report.html', result, ORIGIN)

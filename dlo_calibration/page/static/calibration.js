@@ -5,13 +5,14 @@
 
 import {h} from './dom.js';
 import {Film} from './film.js';
-import {button, numeric, problem, warnings} from './parts.js';
+import {button, files, numeric, problem, warnings} from './parts.js';
 import {resultPanel} from './result.js';
 import {counted, duration, isComponent, number, words} from './words.js';
 
 const PLACE = 'calibration';
 const MUCH = 0.4; // share of the standard deviation that remains: below, the trial shows much of a parameter
 const SOME = 0.8;
+const VERDICTS = {agrees: 'good', changed: 'bad'};
 
 export class CalibrationStep {
   title = 'Calibrate';
@@ -20,6 +21,7 @@ export class CalibrationStep {
   evaluations = null;
   namespace = '/calibrator';
   sent = null; // what the node answered
+  checked = null; // whether the trials show the DLO of an earlier result
   #announced = 0;
   #before = null;
 
@@ -34,9 +36,9 @@ export class CalibrationStep {
   }
 
   missing() {
-    const {state, document: {trials}} = this.app.project;
+    const {trials} = this.app.project.state;
     if (!trials.length) return ['a trial'];
-    return trials.some((trial, k) => state.trials[k]?.complete) ? [] : ['a complete trial'];
+    return trials.some((trial) => trial.complete) ? [] : ['a complete trial'];
   }
 
   done() {
@@ -52,7 +54,10 @@ export class CalibrationStep {
     const trials = h(
       'section',
       {key: 'trials', 'aria-label': 'Trials'},
-      edited.trials.map((trial, k) => this.#trial(state.trials[k], k)),
+      state.trials.map((trial, k) => this.#trial(trial, k)),
+      edited.films.map((film) =>
+        button(`Watch ${film.name}`, () => app.openFilm(film.id), {key: film.id}),
+      ),
     );
     const start = h(
       'div.group',
@@ -63,7 +68,40 @@ export class CalibrationStep {
         ? h('p.problem', {role: 'alert'}, calibration.text)
         : null,
     );
-    return calibration.result && !busy ? [resultPanel(this, calibration), start, trials] : [trials, start];
+    const check = busy ? null : this.#check();
+    return calibration.result && !busy
+      ? [resultPanel(this, calibration), start, check, trials]
+      : [trials, start, check];
+  }
+
+  #check() {
+    const {app} = this;
+    return h(
+      'details',
+      {key: 'check'},
+      h('summary', {}, 'Still the same DLO?'),
+      h('p.note', {}, 'Compare these trials with an earlier result of the DLO, a result.xml.'),
+      files({
+        text: 'Choose a result …',
+        accept: '.xml',
+        key: 'file',
+        onfiles: async ([file]) => {
+          this.checked = {verdict: 'comparing', words: ['This takes some seconds …']};
+          app.refresh();
+          this.checked = await app.project.ask('check', {body: file, name: file.name, place: 'check'});
+          app.refresh();
+        },
+      }),
+      this.checked
+        ? h(
+            'div',
+            {role: 'status'},
+            h('strong.verdict', {class: VERDICTS[this.checked.verdict] ?? 'weak'}, this.checked.verdict),
+            this.checked.words.map((text) => h('p', {}, text)),
+          )
+        : null,
+      problem(app.project, 'check'),
+    );
   }
 
   #trial(trial, k) {

@@ -1,12 +1,13 @@
 // SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 // SPDX-License-Identifier: Apache-2.0
 
-/** The computer's camera: a preview, and a button that takes a photograph. */
+/** The computer's camera: a preview, and buttons that take a photograph or record a film. */
 
 import {h, patch} from './dom.js';
 import {button} from './parts.js';
 
 const WISH = {video: {width: {ideal: 4000}, height: {ideal: 3000}, facingMode: 'environment'}, audio: false};
+const RATE = 12e6; // bits of a film in a second
 const REASONS = {
   NotAllowedError:
     'The browser does not allow this page to use the camera; allow it beside the address, then try again.',
@@ -20,7 +21,7 @@ const NO_DEVICES =
 /**
  * Open the camera's dialogue.
  *
- * @param {(file: File) => void} take called with each photograph
+ * @param {(file: File) => void} take called with each photograph and film
  */
 export async function openCamera(take) {
   const dialog = document.getElementById('camera');
@@ -28,7 +29,26 @@ export async function openCamera(take) {
   let count = 0;
   let text = 'The camera is being opened …';
   let failed = false;
-  const end = () => stream?.getTracks().forEach((track) => track.stop());
+  let recorder = null;
+  const end = () => {
+    recorder?.stop();
+    stream?.getTracks().forEach((track) => track.stop());
+  };
+  const record = () => {
+    if (recorder) return recorder.stop();
+    const pieces = [];
+    recorder = new MediaRecorder(stream, {videoBitsPerSecond: RATE});
+    recorder.ondataavailable = ({data}) => pieces.push(data);
+    recorder.onstop = () => {
+      const kind = recorder.mimeType.includes('mp4') ? 'mp4' : 'webm';
+      recorder = null;
+      take(new File(pieces, `film ${new Date().toLocaleTimeString('en-GB').replace(/:/g, '.')}.${kind}`));
+      if (dialog.open) dialog.close();
+    };
+    recorder.start();
+    text = 'Recording: keep hands away for two seconds, move the DLO, take the hand away, and wait until it rests.';
+    return draw();
+  };
   const draw = () => {
     patch(dialog, [
       h('h2', {id: 'camera-title'}, 'Camera'),
@@ -37,7 +57,10 @@ export async function openCamera(take) {
       h(
         'div.row',
         {},
-        button('Take photograph', shoot, {class: 'primary', disabled: !stream}),
+        button('Take photograph', shoot, {class: 'primary', disabled: !stream || Boolean(recorder)}),
+        window.MediaRecorder
+          ? button(recorder ? 'Stop recording' : 'Record a film', record, {disabled: !stream})
+          : null,
         button('Close', () => dialog.close()),
       ),
     ]);

@@ -5,6 +5,7 @@
 
 import {CalibrationStep} from './calibration.js';
 import {h, patch} from './dom.js';
+import {FilmStep} from './filming.js';
 import {listen} from './gestures.js';
 import {HandsStep} from './hands.js';
 import {button} from './parts.js';
@@ -37,6 +38,7 @@ class App {
   constructor() {
     this.player = new Player(() => this.refresh());
     this.photographs = new PhotographsStep(this);
+    this.film = new FilmStep(this);
     this.steps = [
       this.photographs,
       new ScaleStep(this),
@@ -75,7 +77,22 @@ class App {
   }
 
   get current() {
-    return this.steps[this.step];
+    return this.film.id ? this.film : this.steps[this.step];
+  }
+
+  /** @returns {boolean} whether a step is of no use, since all trials are filmed */
+  skips(step) {
+    const {films, photographs} = this.project.document;
+    return films.length > 0 && !photographs.length && step > 0 && step < this.steps.length - 1;
+  }
+
+  /** Show a film, in place of the steps. */
+  openFilm(id) {
+    this.project.clear();
+    this.film.open(id);
+    this.#fit = true;
+    this.view.unsettle();
+    this.refresh();
   }
 
   /** @returns {object | undefined} the trial that is worked on */
@@ -101,6 +118,7 @@ class App {
   /** Go to a step. */
   go(step, focus = true) {
     this.step = step;
+    this.film.close();
     this.player.stop();
     this.project.clear();
     const {role} = this.current;
@@ -170,12 +188,16 @@ class App {
       ]);
     this.trial = Math.max(0, Math.min(this.trial, this.project.document.trials.length - 1));
     if (!this.id) this.role = this.entry?.start ? 'start' : 'goal';
+    if (this.film.id && !this.film.entry) this.film.close(); // it was removed
     const {current} = this;
     patch(of('top'), this.#top());
-    of('work').hidden = this.step === 0;
-    of('main').className = this.step === 0 ? 'wide' : '';
+    const filming = current === this.film;
+    const wide = !filming && (this.step === 0 || (this.skips(1) && !this.id));
+    of('work').hidden = wide;
+    of('main').className = wide ? 'wide' : '';
     patch(of('panel'), [h('div.panel', {key: current.title}, this.#panel())]);
-    if (this.step === 0) return null;
+    if (wide) return null;
+    if (filming) return this.#showFilm();
     patch(of('strip'), this.#strip());
     const {seen} = this;
     this.view.show(seen ? this.id : null, seen ?? null);
@@ -191,6 +213,22 @@ class App {
     this.view.draw(seen ? current.drawn() : [], seen ? (current.bubbles?.() ?? []) : [], seen?.trace?.pixels);
     patch(of('tools'), this.#tools());
     patch(of('player'), current.player?.() ?? []);
+    if (this.#fit) this.view.fit();
+    this.#fit = false;
+    this.view.settle();
+    return null;
+  }
+
+  #showFilm() {
+    const {film} = this;
+    const seen = film.seen?.width ? film.seen : null;
+    patch(of('strip'), []);
+    this.view.show(seen ? `film ${film.id}` : null, seen, film.picture);
+    of('stage').setAttribute('aria-label', `${film.entry.name}. Click along the DLO.`);
+    of('stage').classList.add('clicks');
+    this.view.draw(seen ? film.drawn() : [], []);
+    patch(of('tools'), this.#tools());
+    patch(of('player'), film.player());
     if (this.#fit) this.view.fit();
     this.#fit = false;
     this.view.settle();
@@ -216,12 +254,12 @@ class App {
           this.steps.map((step, k) =>
             h(
               'li',
-              {},
+              {key: k, hidden: this.skips(k)},
               h(
                 'button',
                 {
                   type: 'button',
-                  'aria-current': k === this.step ? 'step' : null,
+                  'aria-current': k === this.step && !this.film.id ? 'step' : null,
                   class: step.done() ? 'done' : null,
                   onclick: () => this.go(k),
                 },
@@ -272,7 +310,9 @@ class App {
   #panel() {
     const {current} = this;
     const missing = current.missing();
-    const next = this.steps[this.step + 1];
+    if (current === this.film) return this.#filmPanel();
+    const following = this.steps.findIndex((_, k) => k > this.step && !this.skips(k));
+    const next = this.steps[following];
     const open = this.#open();
     const {adding} = this.photographs;
     return [
@@ -285,7 +325,7 @@ class App {
       h(
         'div.onward',
         {},
-        this.step ? button('Back', () => this.go(this.step - 1)) : null,
+        this.step ? button('Back', () => this.go(this.skips(this.step - 1) ? 0 : this.step - 1)) : null,
         open
           ? button(
               `Go on: ${current.ready ? `the ${this.placed(...open)}` : `trial ${open[0] + 1}`}`,
@@ -299,11 +339,29 @@ class App {
           ? h('span.note', {}, `Wait until ${counted(adding, 'photograph is', 'photographs are')} added.`)
           : null,
         next
-          ? button(`Next: ${next.title}`, () => this.go(this.step + 1), {
+          ? button(`Next: ${next.title}`, () => this.go(following), {
               class: missing.length ? null : 'primary',
               disabled: adding > 0,
             })
           : null,
+      ),
+    ];
+  }
+
+  #filmPanel() {
+    const {film} = this;
+    const last = this.steps.length - 1;
+    return [
+      h('h2', {id: 'title', tabindex: -1}, 'Film'),
+      h('p.what', {}, film.what()),
+      ...film.panel(),
+      h(
+        'div.onward',
+        {},
+        button('Back', () => this.go(0)),
+        button(`Next: ${this.steps[last].title}`, () => this.go(last), {
+          class: film.done() ? 'primary' : null,
+        }),
       ),
     ];
   }

@@ -11,7 +11,8 @@ import {button, choice, files, problem} from './parts.js';
 import {address} from './picture.js';
 import {counted} from './words.js';
 
-const ACCEPT = 'image/jpeg,image/png,.jpg,.jpeg,.png';
+const ACCEPT = 'image/jpeg,image/png,video/*,.jpg,.jpeg,.png,.mp4,.mov,.webm,.mkv,.avi';
+const FILM = /\.(mp4|m4v|mov|webm|mkv|avi|3gp)$/i;
 const PHOTOGRAPH = /\.(jpe?g|png|heic|heif|avif|webp|tiff?|bmp|gif)$/i; // the server refuses some, and says why
 const PLACE = 'photographs';
 const SLOTS = {start: 'Start: before the hand moves', goal: 'Goal: when the DLO lies still again'};
@@ -47,32 +48,39 @@ export class PhotographsStep {
   }
 
   missing() {
-    const {photographs, trials} = this.app.project.document;
-    if (!photographs.length) return ['two photographs'];
+    const {films, photographs, trials} = this.app.project.document;
+    if (!photographs.length) return films.length ? [] : ['two photographs, or a film'];
     return trials.flatMap((trial, k) => (trial.goal ? [] : [`the goal photograph of trial ${k + 1}`]));
   }
 
   done() {
-    const {trials} = this.app.project.document;
-    return trials.length > 0 && trials.every((trial) => trial.goal);
+    const {films, trials} = this.app.project.document;
+    return trials.length + films.length > 0 && trials.every((trial) => trial.goal);
   }
 
   /** Add files, one after the other. */
   async add(chosen) {
     this.#refusals = [];
-    const wanted = chosen.length === 1 ? chosen : chosen.filter((file) => PHOTOGRAPH.test(file.name));
+    const wanted = chosen.length === 1 ? chosen : chosen.filter((file) => PHOTOGRAPH.test(file.name) || FILM.test(file.name));
     if (chosen.length && !wanted.length)
-      this.#refusals.push('There is no photograph among these files: add JPEG or PNG files.');
+      this.#refusals.push('There is no photograph or film among these files: add JPEG, PNG or mp4 files.');
     const {app} = this;
     const before = new Set(app.project.document.photographs.map((photograph) => photograph.id));
+    let opened = null; // the newest film
     this.adding += wanted.length;
-    if (app.step) app.go(0);
+    if (app.step || app.film.id) app.go(0);
     for (const file of wanted) {
       app.say(`${file.name} is being added`);
       app.refresh();
-      const answer = await app.project.ask('photographs', {body: file, name: file.name, place: PLACE});
+      const film = FILM.test(file.name);
+      const answer = await app.project.ask(film ? 'films' : 'photographs', {
+        body: file,
+        name: file.name,
+        place: PLACE,
+      });
       this.adding -= 1;
-      if (answer) this.#last = answer.id;
+      if (answer && film) opened = answer.id;
+      else if (answer) this.#last = answer.id;
       else {
         this.#refusals.push(app.project.problem.text);
         app.project.clear();
@@ -83,28 +91,29 @@ export class PhotographsStep {
       app.project.document.trials.findIndex((trial) => !before.has(trial.goal ?? trial.start)),
     );
     app.say(this.adding ? '' : 'All photographs are added');
+    if (opened && !this.adding) app.openFilm(opened);
     app.refresh();
   }
 
   panel() {
-    const {document: {photographs, trials}, state} = this.app.project;
+    const {document: {films, photographs, trials}, state} = this.app.project;
     const some = photographs.length > 0;
     return [
-      some ? null : introduction(),
+      some || films.length ? null : introduction(),
       h(
         'div.drop',
         {},
         h(
           'p',
           {},
-          h('strong', {}, 'Drop photographs here'),
-          ' or anywhere on the page: JPEG or PNG, the first one before the hand moves.',
+          h('strong', {}, 'Drop photographs or a film here'),
+          ' or anywhere on the page: JPEG or PNG, the first one before the hand moves; or a film (mp4, mov, webm, mkv) of the DLO before, while and after hands move it.',
         ),
         h(
           'div.row',
           {},
           files({
-            text: 'Choose photographs …',
+            text: 'Choose photographs or a film …',
             accept: ACCEPT,
             multiple: true,
             primary: !some,
@@ -133,6 +142,18 @@ export class PhotographsStep {
         ),
         problem(this.app.project, PLACE),
       ),
+      films.length
+        ? h(
+            'section',
+            {'aria-label': 'Films'},
+            h('h3', {}, 'Films'),
+            h(
+              'ul.photographs',
+              {},
+              films.map((film) => this.#film(film)),
+            ),
+          )
+        : null,
       some
         ? h(
             'section',
@@ -298,6 +319,46 @@ export class PhotographsStep {
       button('Remove', () => this.#remove(photograph.id), {
         'aria-label': `Remove the photograph ${photograph.name}`,
       }),
+    );
+  }
+
+  #film(film) {
+    const {app} = this;
+    const seen = app.project.state.films[film.id];
+    const used = (seen?.trials ?? []).filter((trial) => trial.used).length;
+    return h(
+      'li',
+      {key: film.id},
+      h('img', {src: `api/films/${film.id}/frame`, alt: '', loading: 'lazy'}),
+      h(
+        'div',
+        {},
+        h('strong', {}, film.name),
+        h(
+          'span.note',
+          {},
+          seen?.duration ? `${seen.width} × ${seen.height} pixels, ${seen.duration.toFixed(1)} s` : '',
+        ),
+        h(
+          'span.note',
+          {},
+          seen?.trials
+            ? counted(used, 'trial')
+            : seen?.progress
+              ? 'The DLO is being followed …'
+              : 'Open it, and click along the DLO.',
+        ),
+        seen?.problem ? h('p.problem', {}, seen.problem) : null,
+      ),
+      button('Open', () => app.openFilm(film.id), {'aria-label': `Open the film ${film.name}`}),
+      button(
+        'Remove',
+        () =>
+          this.#change((now) => {
+            now.films = now.films.filter((other) => other.id !== film.id);
+          }),
+        {'aria-label': `Remove the film ${film.name}`},
+      ),
     );
   }
 

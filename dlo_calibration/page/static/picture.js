@@ -38,6 +38,15 @@ export class Picture {
     if (id) this.#ask(0);
   }
 
+  /** Show an element, such as a film, of a size in pixels. */
+  hold(element, size) {
+    this.#id = null;
+    this.#size = size;
+    this.#asked = WIDTHS.length;
+    if (this.holder.firstChild !== element) this.holder.replaceChildren(element);
+    this.onload();
+  }
+
   /** Place the picture, and fetch a sharper one where this one is too coarse. */
   place(scale, left, top) {
     if (!this.#size) return;

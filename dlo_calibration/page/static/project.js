@@ -42,6 +42,11 @@ export class Project extends EventTarget {
         this.state.trials[trial].information = information.information ?? information;
       this.#changed();
     });
+    events.addEventListener('films', (event) => {
+      const {id, progress} = JSON.parse(event.data);
+      if (this.state?.films[id]) this.state.films[id].progress = progress;
+      this.#changed();
+    });
     events.onerror = () => this.#connection(false);
     events.onopen = () => {
       if (!this.connected) this.#again();

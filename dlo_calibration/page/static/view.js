@@ -45,15 +45,20 @@ export class View {
    *
    * @param {string | null} id
    * @param {{width: number, height: number} | null} size in pixels
+   * @param {HTMLElement | null} element that shows it; null: the picture of a photograph
    */
-  show(id, size) {
-    if (id === this.#shown) return;
+  show(id, size, element = null) {
+    if (id === this.#shown) {
+      if (element) this.picture.hold(element, size);
+      return;
+    }
     if (this.#shown) this.#places.set(this.#shown, [this.scale, this.left, this.top]);
     const alike = this.#size && size && size.width === this.#size.width && size.height === this.#size.height;
     const place = this.#places.get(id);
     this.#shown = id;
     this.#size = size;
-    this.picture.show(id, size);
+    if (element) this.picture.hold(element, size);
+    else this.picture.show(id, size);
     if (!size) return;
     if (place) [this.scale, this.left, this.top] = place;
     if (place || alike) this.#apply();

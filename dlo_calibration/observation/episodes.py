@@ -1,0 +1,453 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Episodes: a film of a DLO and of hands, cut where the DLO rests before and after hands were at work.
+
+Which point a hand holds, when it closes and when it opens follows from the DLO and the hand moving together.
+One camera shows a point of the DLO only on its line of sight; the points are given where that line meets the
+level of a DLO on the table.  Points near a hand that lifts the DLO are left out, as their height is unknown.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_calibration.errors import InputError
+from dlo_calibration.model.action import Hand, NO_ROTATION, rotation_matrix
+from dlo_calibration.model.chain import Chain, Floats, frozen_array, interpolate_unseen
+
+SPAN = 0.1  # s to either side over which a motion is measured
+MOVES = 0.010  # m/s; a DLO of which some points move faster moves
+NOISE, QUIET = 2.5, 0.25  # times the motion below which a DLO is in a quarter of all pictures
+MOVED = 0.005  # m; a shorter movement is none
+SHARE = 8  # of a DLO's points that are taken together when its motion is measured: one in so many
+STILL = 0.015  # m/s; a hand that moves slower stands still
+REST = 0.5  # s; a shorter rest is a pause of the same movement
+WAY = 0.012  # m; the shortest way of a hand that moves a DLO
+PLACES = 101  # along the DLO at which a hand may hold it
+HELD = 0.012  # m; from a hand to the point that it holds, at most, over most of the movement
+BESIDE = 0.005  # of a grip's distance from its tag that counts as error: of places alike, the nearest is held
+TRUSTED = 0.9  # of the pictures of a movement; in the others, the tracker may be wrong
+AT_REST = 0.003  # m; nearer to where a hand closes, it stands there
+REACH = 0.25  # m from a tag to what the hand holds, at most
+LIFTED = 0.008  # m above the table
+#: A beam that is lifted by its diameter leaves the table at 6 to 12 diameters to either side, and with the
+#: fourth root of the height farther away (see vision.axis.BUMP); a limp one hangs down.
+BUMP, SLACK = 12.0, 1.5
+TAG_ABOVE = 0.06  # m, from what a hand holds up to its tag, at most, where its grip is not yet known
+THIN, SHIFT = 0.1, 0.003  # s, m; goals of a DLO that moves lie at least so far apart
+START, END = 4.0, 2.5  # s of rest before and after a movement that are used at most
+LEAVES = 1.0  # s after it, in which a hand still hides a part of the DLO; left out if the rest is longer
+FEWEST = 12  # chains of a rest, as for a stream of goals; fewer are given as their mean
+PATH = 0.03  # s between waypoints of a hand, at least
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """
+    What a tracker saw of a DLO.
+
+    :param times: (n,) of the pictures, increasing [s].
+    :param points: (n, m, 3) evenly spaced material points in the table's frame [m], at the level of a DLO on
+        the table; NaN where they were not seen.
+    :param cameras: (n, 3) where the camera was [m]; None: the points were measured in space.
+    :param radius: of the DLO [m].
+    """
+
+    times: Floats
+    points: Floats
+    cameras: Floats | None = None
+    radius: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ('times', 'points', 'cameras'):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, frozen_array(getattr(self, name)))
+
+
+@dataclass(frozen=True, eq=False)
+class HandSightings:
+    """
+    What was seen of a hand: the poses of its tag, or where the point is that it holds.
+
+    :param positions: (n, 3) [m], at the times of the DLO's sightings; NaN where unknown.
+    :param orientations: (n, 4) quaternions x y z w; None: it does not turn.
+    :param place: share of the length at which it holds the DLO, where a person said so; the positions are
+        then those of this point.
+    """
+
+    name: str
+    positions: Floats
+    orientations: Floats | None = None
+    place: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """
+    What happened from one rest of the DLO to the next one.
+
+    :param start: of the rest before [s]; `end` is that of the rest after.
+    :param initial: the DLO at rest before.
+    :param hands: their paths, with the times of the film; closed at the first waypoint, opened at the last.
+    :param places: share of the length at which each holds the DLO.
+    :param goals: times [s] and points (m, 3) [m] of the DLO afterwards.
+    :param moving: number of goals that show the DLO while it is moved.
+    """
+
+    start: float
+    end: float
+    initial: Chain
+    hands: tuple[Hand, ...]
+    places: tuple[float, ...]
+    goals: tuple[tuple[float, Floats], ...]
+    moving: int
+
+
+@dataclass(frozen=True)
+class _Hold:
+    """A hand that holds the DLO, from one picture to another; `offset` leads from its tag to the grip."""
+
+    hand: HandSightings
+    place: float
+    offset: Floats
+    first: int
+    last: int
+
+
+def episodes(seen: Sightings, hands: Sequence[HandSightings],
+             count: int | None = None) -> tuple[tuple[Episode, ...], tuple[str, ...]]:
+    """
+    Return the episodes of a film, and a sentence about each movement that makes none.
+
+    :param count: of points of their chains; None: as many as were seen.
+    """
+    motion = _motion(seen)
+    cut: list[Episode] = []
+    problems: list[str] = []
+    movements = _movements(seen, motion)
+    bounds = [0, *(last for _, last in movements), len(seen.times) - 1]
+    starts = [first for first, _ in movements[1:]] + [len(seen.times) - 1]
+    for before, (first, last), after in zip(bounds, movements, starts, strict=False):
+        span = f'{seen.times[first]:.1f} to {seen.times[last]:.1f} s'
+        try:
+            cut.append(_episode(seen, hands, motion, (before, first, last, after), count))
+        except InputError as error:
+            problems.append(f'{span}: {error}')
+    return tuple(cut), tuple(problems)
+
+
+def _episode(seen: Sightings, hands: Sequence[HandSightings], motion: Floats,
+             pictures: tuple[int, int, int, int], count: int | None) -> Episode:
+    """
+    Return the episode of one movement.
+
+    :param pictures: the last one of the movement before, the first and the last one of this movement, and
+        the first one of the next.
+    :raises InputError: where nothing shows what moved the DLO, or where it did not rest.
+    """
+    before, first, last, after = pictures
+    times = seen.times
+    rest = _between(times, max(times[before], times[first] - START), times[first] - SPAN)
+    rest = rest[rest >= before]
+    if not len(rest):
+        raise InputError('movement', 'a DLO that moves from the beginning', f'a rest of {REST:g} s before it',
+                         'begin to film earlier, or wait between two movements')
+    start = _resting(seen.points[rest])
+    initial = Chain(start)
+    holds = [hold for hand in hands if (hold := _hold(seen, hand, initial, motion, first, last)) is not None]
+    if not holds:
+        raise InputError('movement', 'no tag that moves with the DLO' if hands else 'no tag in the film',
+                         'one on what moves it', 'glue a tag on what holds the DLO where it is seen, or '
+                         'click the point that is held (--held)')
+    closes, opens = min(hold.first for hold in holds), max(hold.last for hold in holds)
+    initial = Chain(_fewer(start, count))
+    paths = [_path(seen, hold, initial) for hold in holds]
+    begin = times[max(last, opens)] + SPAN
+    begin += LEAVES if times[after] - begin > LEAVES + END else 0.0
+    settled = _between(times, begin, min(begin + END, times[after]))
+    settled = settled[(settled <= after) & (settled > opens)]
+    if not len(settled):
+        raise InputError('movement', 'a film that ends, or a next movement that begins, before the DLO rests',
+                         f'a rest of {REST:g} s after it', 'wait after each movement')
+    moving = _thinned(seen, closes, opens)
+    goals = [(float(times[k]), points) for k in moving if (points := _low(seen, holds, k)) is not None]
+    chains = [(float(times[k]), seen.points[k]) for k in settled if _usable(seen.points[k])]
+    if len(chains) < FEWEST:
+        mean = _resting(seen.points[settled])
+        chains = [(float(times[settled[-1]]), mean)] if _usable(mean) else []
+    if not chains:
+        raise InputError('movement', 'a DLO of which less than half is seen afterwards', 'the whole DLO',
+                         'take the hand away after each movement')
+    chains = [(time, _fewer(points, count)) for time, points in (*goals, *chains)]
+    return Episode(float(times[rest[0]]), chains[-1][0], initial, tuple(paths),
+                   tuple(hold.place for hold in holds), tuple(chains), len(goals))
+
+
+def _fewer(points: Floats, count: int | None) -> Floats:
+    """Return `count` evenly spaced points of a chain (m, 3); NaN beside points that were not seen."""
+    if count is None or count == len(points):
+        return points
+    return _at(points, np.linspace(0.0, 1.0, count))
+
+
+def _between(times: Floats, begin: float, end: float) -> NDArray[np.intp]:
+    return np.flatnonzero((times >= begin - 1e-9) & (times <= end + 1e-9))
+
+
+def _resting(points: Floats) -> Floats:
+    """
+    Return the median (m, 3) of chains (k, m, 3) at rest; NaN where fewer than a third show a point.
+
+    A hand that comes or goes hides a part for less than half of the time.
+    """
+    median = _median(points)
+    median[np.isfinite(points[..., 0]).sum(axis=0) < max(1, len(points) // 3)] = np.nan
+    return median
+
+
+def _usable(points: Floats) -> bool:
+    """Return whether a chain shows enough points, see `Chain`."""
+    return bool(np.isfinite(points[:, 0]).sum() >= max(3, -(-len(points) // 2)))
+
+
+def _motion(seen: Sightings) -> Floats:
+    """Return the speed (n,) [m/s] of the DLO: that of its fastest part, with several points."""
+    times = seen.times
+    speeds = np.zeros(len(times))
+    if times[-1] - times[0] <= 2.0 * SPAN:
+        return speeds
+    middle = np.clip(times, times[0] + SPAN, times[-1] - SPAN)
+    early = np.searchsorted(times, middle - SPAN - 1e-9)
+    late = np.searchsorted(times, middle + SPAN + 1e-9)
+    for k, (begin, end) in enumerate(zip(early, late, strict=True)):
+        half = (begin + end) // 2
+        if half > begin and end > half:
+            # The medians of both halves are half the span apart.
+            speeds[k] = _shift(_median(seen.points[begin:half]), _median(seen.points[half:end])) / SPAN
+    return speeds
+
+
+def _shift(begin: Floats, end: Floats) -> float:
+    """Return by how much the part of the DLO that moves most has moved between chains (m, 3) [m]."""
+    steps = end - begin
+    steps = steps[np.isfinite(steps[:, 0])]
+    width = max(len(steps) // SHARE, 1)
+    if len(steps) < width:
+        return 0.0
+    sums = np.cumsum(np.vstack([np.zeros(3), steps]), axis=0)
+    return float(np.linalg.norm(sums[width:] - sums[:-width], axis=1).max()) / width
+
+
+def _median(points: Floats) -> Floats:
+    shown = np.isfinite(points[..., 0]).any(axis=0)
+    median = np.full(points.shape[1:], np.nan)
+    median[shown] = np.nanmedian(points[:, shown], axis=0)
+    return median
+
+
+def _movements(seen: Sightings, motion: Floats) -> list[tuple[int, int]]:
+    """Return the first and last picture of each movement, which rests of REST separate."""
+    least = max(MOVES, NOISE * float(np.quantile(motion, QUIET)))
+    moving = np.flatnonzero(motion > least)
+    if not len(moving):
+        return []
+    pieces = np.split(moving, np.flatnonzero(np.diff(seen.times[moving]) > REST) + 1)
+    around = [(seen.points[max(piece[0] - 4, 0):piece[0] + 1], piece) for piece in pieces]
+    return [(int(piece[0]), int(piece[-1])) for before, piece in around if max(
+        _shift(_median(before), _median(seen.points[k:k + 5])) for k in piece) > MOVED]
+
+
+def _complete(points: Floats) -> Floats | None:
+    """Return a chain (m, 3) with its unseen points interpolated; None if too few are seen."""
+    shown = np.isfinite(points[:, 0])
+    if shown.all():
+        return points
+    return interpolate_unseen(points, shown, np.arange(float(len(points)))) if _usable(points) else None
+
+
+def _at(points: Floats, places: Floats) -> Floats:
+    """Return the points (p, 3) of a chain (m, 3) at shares (p,) of its length."""
+    at = places * (len(points) - 1)
+    below = np.minimum(np.floor(at + 1e-9).astype(int), len(points) - 1)
+    beyond = np.minimum(below + 1, len(points) - 1)
+    weight = np.clip(at - below, 0.0, 1.0)[:, None]
+    between = (1.0 - weight) * points[below] + weight * points[beyond]
+    return np.asarray(np.where(weight < 1e-6, points[below], between))  # not NaN for one beside it
+
+
+def _hold(seen: Sightings, hand: HandSightings, initial: Chain, motion: Floats, first: int,
+          last: int) -> _Hold | None:
+    """Return how a hand holds the DLO in a movement, from picture `first` to `last`; None: it does not."""
+    times = seen.times
+    if hand.place is not None:
+        return _Hold(hand, hand.place, np.zeros(3), max(first - 1, 0), last)
+    known = np.isfinite(hand.positions[:, 0])
+    speed = _speed(times, hand.positions)
+    near = _between(times, times[first] - 3 * SPAN, times[first] + 1.5 * SPAN)
+    near = near[known[near]]
+    span = np.arange(first, last + 1)
+    span = span[known[span]]
+    if not len(near) or len(span) < 3:
+        return None
+    still = near[speed[near] < STILL]
+    closes = int(still[-1]) if len(still) else int(near[speed[near].argmin()])
+    if np.linalg.norm(hand.positions[span] - hand.positions[closes], axis=1).max() < WAY:
+        return None
+    turns = _rotations(hand)
+    places = np.linspace(0.0, 1.0, PLACES)
+    held = initial.resample(places * initial.length)
+    there = near[near <= closes]
+    there = there[np.linalg.norm(hand.positions[there] - hand.positions[closes], axis=1) < AT_REST]
+    offsets = np.mean([(held - hand.positions[k]) @ turns[k] for k in there], axis=0)  # (PLACES, 3)
+    compared = span[np.unique(np.linspace(0, len(span) - 1, min(len(span), 60)).astype(int))]
+    away = np.full((len(compared), PLACES), np.nan)
+    for row, k in enumerate(compared):
+        chain = _complete(seen.points[k])
+        if chain is not None:
+            away[row] = _apart(seen, k, hand.positions[k] + offsets @ turns[k].T, _at(chain, places))
+    if not np.isfinite(away).any():
+        return None
+    away = np.sort(away[np.isfinite(away[:, 0])], axis=0)
+    typical = np.sqrt(np.mean(away[:max(round(TRUSTED * len(away)), 1)]**2, axis=0))
+    reach = np.linalg.norm(offsets, axis=1)
+    cost = np.hypot(typical, BESIDE * reach)
+    cost[reach > REACH] = np.inf
+    best = int(cost.argmin())
+    if not typical[best] < HELD:
+        return None
+    return _Hold(hand, float(places[best]), offsets[best], closes,
+                 _opens(seen, hand, turns, offsets[best], float(places[best]), motion, speed, closes, last))
+
+
+def _opens(seen: Sightings, hand: HandSightings, turns: Floats, offset: Floats, place: float, motion: Floats,
+           speed: Floats, closes: int, last: int) -> int:
+    """
+    Return the picture in which a hand opens.
+
+    That is when the DLO begins to move alone, or when the hand leaves it, or, where neither is seen, when the
+    hand has come to a standstill.
+    """
+    times = seen.times
+    end = int(np.searchsorted(times, times[last] + 1.0))
+    held, away = closes, 0
+    for k in range(closes, min(end, len(times))):
+        chain = _complete(seen.points[k])
+        if chain is None or not np.isfinite(hand.positions[k]).all():
+            continue
+        grip = hand.positions[k] + turns[k] @ offset
+        if _apart(seen, k, grip, _at(chain, np.array([place])))[0] < 1.5 * HELD:
+            held, away = k, 0
+        else:
+            away += 1
+            if away > 5 and k > closes + 5:
+                break
+    still = np.flatnonzero(speed[closes:held + 1] >= STILL)
+    stands = closes + int(still[-1]) + 1 if len(still) else held
+    stands = min(stands, held)
+    if last <= stands:
+        return min(max(last, closes + 1), held) if held > closes else held
+    quiet = np.flatnonzero(motion[stands:last + 1] < MOVES)
+    falls = len(quiet) and motion[stands + quiet[0]:last + 1].max() > MOVES
+    if falls:  # it rested in the hand, and moves again without it
+        again = np.flatnonzero(motion[stands + quiet[0]:last + 1] > MOVES)[0]
+        return min(stands + int(quiet[0]) + int(again), held)
+    return stands
+
+
+def _apart(seen: Sightings, k: int, grips: Floats, points: Floats) -> Floats:
+    """Return the distances (p,) [m] of grips (p, 3) from points (p, 3), or from their lines of sight."""
+    between = grips - points
+    if seen.cameras is not None:
+        ray = points - seen.cameras[k]
+        ray = ray / np.linalg.norm(ray, axis=1, keepdims=True)
+        between = between - (between * ray).sum(axis=1, keepdims=True) * ray
+    return np.asarray(np.linalg.norm(between, axis=1))
+
+
+def _speed(times: Floats, positions: Floats) -> Floats:
+    """Return speeds (n,) [m/s]; infinite where they are unknown."""
+    early = np.maximum(np.arange(len(times)) - 1, 0)
+    late = np.minimum(np.arange(len(times)) + 1, len(times) - 1)
+    lapse = np.maximum(times[late] - times[early], 1e-9)
+    speed = np.linalg.norm(positions[late] - positions[early], axis=1) / lapse
+    return np.asarray(np.where(np.isfinite(speed), speed, np.inf))
+
+
+def _rotations(hand: HandSightings) -> Floats:
+    """Return the rotations (n, 3, 3) of a hand, the identity where they are unknown."""
+    turns = np.tile(np.eye(3), (len(hand.positions), 1, 1))
+    if hand.orientations is not None:
+        for k in np.flatnonzero(np.isfinite(hand.orientations).all(axis=1)):
+            turns[k] = rotation_matrix(hand.orientations[k])
+    return turns
+
+
+def _grip_path(hold: _Hold) -> Floats:
+    """Return where the grip of a hand is in each picture, (n, 3) [m]."""
+    return np.asarray(hold.hand.positions + _rotations(hold.hand) @ hold.offset)
+
+
+def _path(seen: Sightings, hold: _Hold, initial: Chain) -> Hand:
+    """Return the path of a hand while it holds the DLO."""
+    places = _grip_path(hold)
+    known = [k for k in range(hold.first, hold.last + 1) if np.isfinite(places[k]).all()]
+    if len(known) < 2:
+        raise InputError('hand', f'{hold.hand.name}, which is hardly seen while it holds the DLO',
+                         'a tag that the camera sees', 'glue it where the hand does not hide it')
+    kept = [known[0]]
+    for k in known[1:]:
+        if seen.times[k] - seen.times[kept[-1]] >= PATH or k == known[-1]:
+            kept.append(k)
+    point, offset = initial.grip(hold.place * initial.length)
+    turns = np.tile(NO_ROTATION, (len(kept), 1)) if hold.hand.orientations is None else (
+        hold.hand.orientations[kept])
+    return Hand(hold.hand.name, (point,), seen.times[kept], places[kept], turns, offset, True)
+
+
+def without_lifted(points: Floats, tag: Floats, radius: float) -> Floats:
+    """
+    Return points (m, 3) [m] as one camera sees them, without those that a hand may hold in the air.
+
+    :param tag: (3,) where the tag of the hand is [m]; what it holds is nearer than TAG_ABOVE below it.
+    """
+    lifted = float(tag[2]) - TAG_ABOVE - radius
+    if not lifted > 0.0:
+        return points
+    reach = max(BUMP * 2.0 * radius, SLACK * lifted) + TAG_ABOVE
+    low = np.array(points)
+    low[np.linalg.norm(points[:, :2] - tag[:2], axis=1) <= reach] = np.nan
+    return low
+
+
+def _thinned(seen: Sightings, closes: int, opens: int) -> list[int]:
+    """Return pictures between closing and opening that differ."""
+    kept = [closes]
+    for k in range(closes + 1, opens + 1):
+        if seen.times[k] - seen.times[kept[-1]] < THIN or not _usable(seen.points[k]):
+            continue
+        moved = np.linalg.norm(seen.points[k] - seen.points[kept[-1]], axis=1)
+        if np.isfinite(moved).any() and np.nanmax(moved) >= SHIFT:
+            kept.append(k)
+    return kept[1:]
+
+
+def _low(seen: Sightings, holds: Sequence[_Hold], k: int) -> Floats | None:
+    """Return the points (m, 3) of picture k, without those that may be in the air; None if too few remain."""
+    points = np.array(seen.points[k])
+    if seen.cameras is None:
+        return points
+    share = np.linspace(0.0, 1.0, len(points))
+    length = float(np.nansum(np.linalg.norm(np.diff(points, axis=0), axis=1))) or 1.0
+    diameter = max(2.0 * seen.radius, 1e-3)
+    for hold in holds:
+        lifted = float(_grip_path(hold)[k, 2]) - seen.radius
+        if hold.first <= k <= hold.last and lifted > LIFTED:
+            reach = max(BUMP * diameter * (lifted / diameter) ** 0.25, SLACK * lifted)
+            points[np.abs(share - hold.place) * length <= reach] = np.nan
+    return points if _usable(points) else None

@@ -1,0 +1,435 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Tracker: follows a DLO from image to image.
+
+The tracer finds the line in the first image.  In each further one the line is expected where it moved to;
+beside it, strips of the image say where it is now (`middle_line`); the elastic line through these places
+(`elastic`) keeps its length, and bridges what is hidden.  At last the image is compared with the line: what
+does not look like the DLO is not seen; a line that explains too little, or leaves too much unexplained, is
+lost.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import distance_transform_edt, gaussian_filter1d, label
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import dijkstra
+
+from dlo_calibration.model.chain import Floats, frozen_array
+from dlo_calibration.vision.elastic import directions, Evidence, fitted
+from dlo_calibration.vision.middle_line import (
+    along_line,
+    arc_lengths,
+    best_columns,
+    edge_near,
+    edges,
+    end_near,
+    evenly,
+    evidence_of,
+    learn_colours,
+    odds,
+    scores_of,
+    straighten,
+)
+from dlo_calibration.vision.photograph import Pixels
+from dlo_calibration.vision.ridge import Singles
+from dlo_calibration.vision.scale import Scale
+from dlo_calibration.vision.tracer import Tracer
+
+Bools = NDArray[np.bool_]
+
+COUNT = 61  # points along the DLO
+STATIONS = (60, 130)  # of the line that is tracked, at least and at most
+STATION = 0.9  # half widths between them
+FAR = (9.0, 4.0, 2.4)  # half widths: how far each of the strips reaches beside the line
+WIDER = 16.0  # the same of the first one, after the DLO was lost
+STEPS = (0.25, 0.2, 0.08)  # half widths between the offsets of each of them
+DRIFT = 0.15
+SIGMA = (0.5, 0.3, 0.1)  # half widths: standard deviation of the places that each of them gives
+STRETCH = 0.05  # of a segment's length: standard deviation; a part in the air looks longer
+BEND = 0.01  # half widths, standard deviation of a change of second differences from image to image
+FREE = 2.0  # half widths, standard deviation of the place where the line is expected
+STILL = 0.02  # the same along a part that does not move, while another part is in the air
+END = 0.15  # half widths, standard deviation of an end
+MOVES = 0.12  # half widths from image to image, from which on a part moves
+TOLERANCE = 0.006  # share of the length on a table that a line between two visible ends may lack
+UNSCALED = 0.04  # the same in a picture without a scale
+BEYOND = 10.0  # half widths around an end, within which it is looked for
+SEEN = 0.35  # mean logarithm of the odds of a colour from which on the DLO is seen
+APART = 0.6  # half widths between the line and where the image shows it, from which on it is not seen
+LEAST = 0.3  # share of the line that must be seen
+UNEXPLAINED = 0.06  # of the DLO's area: more of its colour elsewhere, near the line, is too much
+DAMPED = 0.7  # of the velocity that remains
+REDUCED = 4.0  # px, width of the DLO in the picture in which colours are counted
+ALIKE = 0.7  # logarithm of the odds from which on a pixel there has the DLO's colour
+SEARCHES = 10  # images from one search of the whole picture to the next
+WRONG_LENGTH = 0.05  # share of the length by which a line that is found again may differ
+
+
+@dataclass(frozen=True, eq=False)
+class Tracked:
+    """
+    Where a DLO is in an image.
+
+    :param pixels: (count, 2) [px], evenly along the DLO: the same material points in each image; not a number
+        where the DLO is not seen.
+    :param width: of the DLO [px].
+    :param reason: why the DLO is lost, one sentence; empty: it is not.
+    """
+
+    pixels: Floats
+    width: float
+    reason: str = ''
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'pixels', frozen_array(self.pixels))
+
+    @property
+    def lost(self) -> bool:
+        """Whether the DLO is lost; then no point is a number."""
+        return bool(self.reason)
+
+
+@dataclass(frozen=True, eq=False)
+class _Line:
+    """
+    A line in an image.
+
+    :param line: (n, 2) [px], evenly along the DLO.
+    :param seen: (n,).
+    :param ends: whether both ends are seen.
+    :param excess: share of the length by which the line between two visible ends is too long.
+    """
+
+    line: Floats
+    seen: Bools
+    ends: tuple[bool, bool]
+    excess: float
+
+
+class Tracker:
+    """
+    Follows a DLO from image to image, forwards or backwards in time.
+
+    :param count: of points along the DLO.
+    """
+
+    def __init__(self, count: int = COUNT) -> None:
+        self._count = count
+
+    def start(self, pixels: Pixels, clicks: ArrayLike, scale: Scale | None = None) -> Tracked:
+        """
+        Find the DLO in the first image.
+
+        :param pixels: (h, w, 3) RGB.
+        :param clicks: (k, 2) [px], k >= 2, rough, in order along the DLO.
+        :param scale: of this image; None: the length is that in the picture.
+        :raises InputError: where there is no DLO along the clicks.
+        """
+        trace = Tracer(pixels).trace(clicks)
+        self._scale, half = scale, trace.width / 2
+        count = int(np.clip(arc_lengths(trace.pixels)[-1] / (STATION * half), *STATIONS))
+        flat = trace.pixels if scale is None else scale.to_table(trace.pixels)
+        arc = arc_lengths(flat)
+        line = along_line(trace.pixels, arc, np.linspace(0.0, arc[-1], count))
+        self._length = float(arc[-1])
+        self._half = half / float(np.median(self._finenesses(line)))  # in units of the length
+        strip = straighten(pixels, line, np.full(count, half), np.arange(-2.4, 2.41, 0.08))
+        self._table = learn_colours(strip, 0.5, (1.4, 2.4))
+        self._line = _Line(line, np.interp(np.linspace(0, 1, count), np.linspace(0, 1, len(trace.sure)),
+                                           trace.sure) > 0.5, (True, True), 0.0)
+        self._velocity: Floats = np.zeros_like(line)
+        self._lost_for = 0
+        self._usual = self._unexplained(pixels, line)
+        return self._tracked()
+
+    def next(self, pixels: Pixels, elapsed: float, scale: Scale | None = None) -> Tracked:
+        """
+        Find the DLO in the next image.
+
+        :param pixels: (h, w, 3) RGB.
+        :param elapsed: time since the image before, also where that was earlier [s]; not below 0.
+        :param scale: of this image; None only if there was none at the start.
+        """
+        if scale is not None and self._scale is not None and scale is not self._scale:
+            moved = scale.to_pixels(self._scale.points(self._line.line))
+            if np.isfinite(moved).all():
+                self._line = replace(self._line, line=moved)
+        self._scale = scale
+        before = self._line.line
+        found = self._followed(pixels, before + self._velocity * elapsed, WIDER if self._lost_for else FAR[0])
+        reason = self._doubt(pixels, found)
+        if reason and self._lost_for % SEARCHES == SEARCHES - 1:
+            again = self._searched(pixels)
+            if again is not None:
+                found, reason = again, ''
+        if reason:
+            self._lost_for += 1
+            self._velocity = np.zeros_like(before)
+            return Tracked(np.full((self._count, 2), np.nan), self._width(), reason)
+        if self._lost_for or elapsed <= 0:
+            self._velocity = np.zeros_like(before)
+        else:
+            change = (found.line - before) / elapsed
+            self._velocity = DAMPED * gaussian_filter1d(change, 2.0, axis=0)
+        self._lost_for = 0
+        self._line = found
+        return self._tracked()
+
+    def _tracked(self) -> Tracked:
+        place = np.linspace(0, len(self._line.line) - 1, self._count)
+        points = along_line(self._line.line, np.arange(float(len(self._line.line))), place)
+        low, high = np.floor(place).astype(int), np.ceil(place).astype(int)
+        points[~(self._line.seen[low] & self._line.seen[high])] = np.nan
+        return Tracked(points, self._width())
+
+    def _width(self) -> float:
+        return 2.0 * self._half * float(np.median(self._finenesses(self._line.line)))
+
+    def _finenesses(self, line: Floats) -> Floats:
+        """Return the pixels (n - 1,) to a unit of the length, of each segment of a line (n, 2)."""
+        if self._scale is None:
+            return np.ones(len(line) - 1)
+        there = np.linalg.norm(np.diff(self._scale.points(line), axis=0), axis=1)
+        here = np.linalg.norm(np.diff(line, axis=0), axis=1)
+        ratios = here / np.maximum(there, 1e-12)
+        ratios[~np.isfinite(ratios)] = np.nanmedian(ratios)
+        return np.asarray(ratios)
+
+    def _followed(self, pixels: Pixels, expected: Floats, far: float) -> _Line:
+        """Return the line near where it is expected."""
+        height, width = pixels.shape[:2]
+        line, count = expected, len(expected)
+        measured, quality = line, np.zeros(count)
+        for stage, (reach, step, sigma) in enumerate(zip((far, *FAR[1:]), STEPS, SIGMA, strict=True)):
+            fineness = self._finenesses(line)
+            half = self._half * np.append(fineness, fineness[-1])
+            offsets = step * np.arange(-float(round(reach / step)), round(reach / step) + 1)
+            strip = straighten(pixels, line, half, offsets)
+            index, quality = self._places(strip, stage, line, half)
+            chosen = offsets[index]
+            inside = ((line > 0) & (line < (width - 1, height - 1))).all(axis=1)
+            quality = quality * inside
+            if stage == len(FAR) - 1:
+                chosen = gaussian_filter1d(quality * chosen, 1.0) / np.maximum(
+                    gaussian_filter1d(quality, 1.0), 1e-3)
+            measured = strip.at(chosen)
+            usual = float(np.median(half))
+            ends = [self._end(pixels, line[::order], half[::order], measured[::order], quality[::order])
+                    for order in (1, -1)]
+            line, accepted, excess = self._elastic(line, measured, quality / (sigma * usual) ** 2, expected,
+                                                   ends, usual, fineness)
+        apart = np.linalg.norm(line - measured, axis=1) / usual
+        fineness = self._finenesses(line)
+        half = self._half * np.append(fineness, fineness[-1])
+        strip = straighten(pixels, line, half, np.linspace(-0.6, 0.6, 9))
+        colours = gaussian_filter1d(odds(self._table, strip.lab).mean(axis=1, dtype=float), 1.0,
+                                    mode='nearest')
+        inside = ((line > -0.5) & (line < (width - 0.5, height - 0.5))).all(axis=1)
+        seen = (colours > SEEN) & (apart < APART) & inside
+        # One station alone is a coincidence.
+        seen = gaussian_filter1d(seen.astype(float), 1.0, mode='nearest') > 0.5
+        return _Line(line, seen & inside, accepted, excess)
+
+    def _places(self, strip: Any, stage: int, line: Floats, half: Floats) -> tuple[NDArray[np.int64], Floats]:
+        """Return the offset's index (n,) where the DLO is in a strip, and how sure that is (n,), 0 to 1."""
+        logarithms = odds(self._table, strip.lab)
+        self._without_others(logarithms, strip, line, half)
+        logarithms = gaussian_filter1d(logarithms, 0.8, axis=0)
+        step = float(strip.offsets[1] - strip.offsets[0])
+        strength = edges(strip, 1.0)
+        scores = scores_of(strip, evidence_of(strip, strength, logarithms), 1.0)
+        scores = scores - np.float32(0.004 if stage else 0.01) * np.square(strip.offsets).astype(np.float32)
+        index = best_columns(scores[None], DRIFT * min(1.0, step / 0.2))[0][0]
+        reach = round(0.6 / step)
+        around = np.clip(index[:, None] + np.arange(-reach, reach + 1), 0, len(strip.offsets) - 1)
+        inside = np.take_along_axis(logarithms, around, axis=1).mean(axis=1, dtype=float)
+        return index, np.clip((inside - 0.2) / 1.0, 0.0, 1.0) ** 2
+
+    @staticmethod
+    def _without_others(logarithms: Singles, strip: Any, line: Floats, half: Floats) -> None:
+        """Take the colours of other strands of the DLO out of a strip."""
+        reach = float(np.abs(strip.offsets).max() + 1.5) * half
+        distance = np.linalg.norm(line[:, None] - line, axis=2)
+        arc = arc_lengths(line)
+        # Another strand is much farther along the line than through the air.
+        apart: Bools = np.abs(arc[:, None] - arc) > 2.0 * distance + 4.0 * half[:, None]
+        near = np.asarray(apart & (distance < reach[:, None]))
+        for row in np.flatnonzero(near.any(axis=1)):
+            others = line[near[row]]
+            at = strip.line[row] + (strip.offsets * strip.half[row])[:, None] * strip.normals[row]
+            explained = np.linalg.norm(at[:, None] - others, axis=2).min(axis=1) < 1.1 * half[row]
+            logarithms[row, explained] = 0.0
+
+    def _end(self, pixels: Pixels, line: Floats, half: Floats, measured: Floats,
+             quality: Floats) -> Floats | None:
+        """Return the place (2,) [px] of the end near the first point of a line; None: it is not seen."""
+        h = float(half[0])
+        # The DLO's last part, as far as it is seen.
+        near = np.flatnonzero(quality[:30] > 0.3)
+        if len(near) < 4:
+            return None
+        first = near[0]
+        part = measured[first:first + 8]
+        towards = part[0] - part[-1]
+        towards = towards / max(float(np.linalg.norm(towards)), 1e-9)
+        inner = measured[first:first + 14]
+        way = np.concatenate([[part[0] + BEYOND * h * towards], inner])
+        way = evenly(way, 0.2 * h)
+        height, width = pixels.shape[:2]
+        arc = arc_lengths(way)
+        inside = ((way > 0) & (way < (width - 1, height - 1))).all(axis=1)
+        if not inside[arc > (BEYOND - 4) * h].all():
+            return None
+        strip = straighten(pixels, way, np.full(len(way), h), np.linspace(-0.25, 0.25, 5))
+        logarithms = odds(self._table, strip.lab).mean(axis=1, dtype=float)
+        logarithms[~inside] = -1.0
+        click = BEYOND * h
+        end = end_near(arc, logarithms, click, BEYOND * h * 0.98)
+        if end is None:
+            return None
+        end = edge_near(arc, strip, end, 0.5 * h)
+        return np.asarray(along_line(way, arc, [end])[0])
+
+    def _elastic(self, line: Floats, measured: Floats, across: Floats, expected: Floats,
+                 ends: list[Floats | None], half: float,
+                 fineness: Floats) -> tuple[Floats, tuple[bool, bool], float]:
+        """Return the elastic line, which of the ends it has, and the excess of its length."""
+        count = len(line)
+        lengths = self._length / (count - 1) * fineness
+        known = Evidence(
+            measured, across, expected, np.full(count, 1.0 / (FREE * half) ** 2), 0.2 / (FREE * half) ** 2,
+            lengths, 1.0 / (STRETCH * float(lengths.mean())) ** 2, 1.0 / (BEND * half) ** 2, np.zeros((2, 2)),
+            np.zeros(2))
+        tolerance = UNSCALED if self._scale is None else TOLERANCE
+        accepted = [end is not None for end in ends]
+        fit, excess = line, 0.0
+        while True:
+            places = np.array([line[k] if end is None else end for k, end in zip((0, -1), ends, strict=True)])
+            weights = np.where(accepted, 1.0 / (END * half) ** 2, 0.0)
+            fit = fitted(line, replace(known, ends=places, end_weights=weights))
+            if not all(accepted):
+                return fit, (accepted[0], accepted[1]), 0.0
+            excess = float((np.linalg.norm(np.diff(fit, axis=0), axis=1) / fineness).sum() / self._length - 1)
+            if excess >= -tolerance:
+                break
+            # What covers an end makes the DLO look shorter.
+            tangents = directions(expected)
+            inwards = [float((places[0] - expected[0]) @ tangents[0]),
+                       float((expected[-1] - places[1]) @ tangents[-1])]
+            accepted[int(np.argmax(inwards))] = False
+        if excess > tolerance:
+            # A part in the air looks longer: it is one that moves, or is hidden.
+            normals = np.column_stack([-directions(line)[:, 1], directions(line)[:, 0]])
+            change = np.abs(((fit - self._line.line) * normals).sum(axis=1))
+            loose = (change > MOVES * half) | (across < 0.1 * across.max())
+            moving = gaussian_filter1d(loose.astype(float), 3.0, mode='nearest')
+            still = np.where(moving > 0.05, known.along, 1.0 / (STILL * half) ** 2)
+            fit = fitted(fit, replace(known, along=still, ends=places, end_weights=weights))
+        return fit, (True, True), excess
+
+    def _doubt(self, pixels: Pixels, found: _Line) -> str:
+        """Return why a line is none, one sentence; empty: it is one."""
+        height, width = pixels.shape[:2]
+        if not np.isfinite(found.line).all():
+            return 'the line could not be fitted: start again with new clicks'
+        inside = ((found.line > 0) & (found.line < (width - 1, height - 1))).all(axis=1)
+        if inside.mean() < LEAST:
+            return 'the DLO has left the picture: show it again'
+        if found.seen.mean() < LEAST:
+            return 'too little of the DLO is seen: take hands out of the way, and move it slowly'
+        if self._unexplained(pixels, found.line) > self._usual + UNEXPLAINED:
+            return 'the DLO is also where the line is not: move it slowly, or start again with new clicks'
+        return ''
+
+    def _mask(self, pixels: Pixels) -> tuple[Bools, int]:
+        """Return where a part of the picture, reduced, has the DLO's colour, and by what it was reduced."""
+        factor = max(1, int(self._width() / REDUCED))
+        lab: Any = cv2.cvtColor(pixels[::factor, ::factor].astype(np.float32) / np.float32(255),
+                                cv2.COLOR_RGB2Lab)
+        return np.asarray(odds(self._table, lab) > ALIKE), factor
+
+    def _unexplained(self, pixels: Pixels, line: Floats) -> float:
+        """Return the area with the DLO's colour that is not near the line, as a share of the DLO's area."""
+        height, width = pixels.shape[:2]
+        thick = self._width()
+        low = np.clip(line.min(axis=0) - 6 * thick, 0, (width - 2, height - 2)).astype(int)
+        high = np.clip(line.max(axis=0) + 6 * thick, low + 2, (width, height)).astype(int)
+        mask, factor = self._mask(pixels[low[1]:high[1], low[0]:high[0]])
+        covered = np.zeros(mask.shape, np.uint8)
+        points = np.rint((line - low) / factor * 16).astype(np.int32)
+        cv2.polylines(covered, [points], False, 1, round(2.2 * thick / factor + 2), cv2.LINE_8, 4)
+        elsewhere: Any = (mask & (covered == 0)).astype(np.uint8)
+        # What is thicker than the DLO, or not much longer than thick, is another thing, such as a hand.
+        kernel = np.ones((round(1.7 * thick / factor) + 1,) * 2, np.uint8)
+        elsewhere &= 1 - cv2.morphologyEx(elsewhere, cv2.MORPH_OPEN, kernel)
+        elsewhere = cv2.morphologyEx(elsewhere, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+        _, _, parts, _ = cv2.connectedComponentsWithStats(elsewhere)
+        areas = parts[1:, cv2.CC_STAT_AREA] * float(factor ** 2)
+        return float(areas[areas > 2.0 * thick ** 2].sum()) / max(thick * float(arc_lengths(line)[-1]), 1.0)
+
+    def _searched(self, pixels: Pixels) -> _Line | None:
+        """Return the line found anywhere in the picture; None: there is none that is sure."""
+        mask, factor = self._mask(pixels)
+        parts, number = label(mask, np.ones((3, 3)))
+        if not number:
+            return None
+        sizes = np.bincount(parts.ravel())[1:]
+        v, u = np.nonzero(parts == int(np.argmax(sizes)) + 1)
+        path = _longest(u, v, mask)
+        if len(path) < 8:
+            return None
+        rough = path * factor
+        if np.linalg.norm(rough[0] - self._line.line[0]) + np.linalg.norm(rough[-1] - self._line.line[-1]) > (
+                np.linalg.norm(rough[0] - self._line.line[-1])
+                + np.linalg.norm(rough[-1] - self._line.line[0])):
+            rough = rough[::-1]
+        smooth = gaussian_filter1d(evenly(rough, 2.0 * factor), 3.0, axis=0, mode='nearest')
+        kept, count = self._line, len(self._line.line)
+        flat = smooth if self._scale is None else self._scale.points(smooth)
+        arc = arc_lengths(flat)
+        if not abs(arc[-1] / self._length - 1) < 2 * WRONG_LENGTH:
+            return None
+        line = along_line(smooth, arc, np.linspace(0, arc[-1], count))
+        self._line = _Line(line, np.ones(count, bool), (True, True), 0.0)
+        found = self._followed(pixels, line, FAR[1])
+        if (self._doubt(pixels, found) or found.seen.mean() < 0.8 or not all(found.ends)
+                or abs(found.excess) > WRONG_LENGTH):
+            self._line = kept
+            return None
+        return found
+
+
+def _longest(u: NDArray[np.int64], v: NDArray[np.int64], mask: Bools) -> Floats:
+    """Return the path (n, 2) between the two places of an area that are farthest apart within it."""
+    depth = distance_transform_edt(mask)[v, u]
+    index = np.full(mask.shape, -1)
+    index[v, u] = np.arange(len(u))
+    rows, columns, costs = [], [], []
+    height, width = mask.shape
+    for x, y in ((1, 0), (0, 1), (1, 1), (-1, 1)):
+        inside = (u + x >= 0) & (u + x < width) & (v + y < height)
+        other = index[(v + y)[inside], (u + x)[inside]]
+        pairs = np.flatnonzero(inside)[other >= 0]
+        other = other[other >= 0]
+        rows.append(pairs)
+        columns.append(other)
+        costs.append(np.hypot(x, y) * (1.0 + 2.0 / np.minimum(depth[pairs], depth[other]) ** 2))
+    graph = coo_matrix((np.concatenate(costs), (np.concatenate(rows), np.concatenate(columns))),
+                       shape=(len(u), len(u))).tocsr()
+    begin = 0
+    for _ in range(2):
+        far, before = dijkstra(graph, False, begin, return_predecessors=True)
+        start, begin = begin, int(np.argmax(np.where(np.isfinite(far), far, -1.0)))
+    path = [begin]
+    while path[-1] != start and before[path[-1]] >= 0:
+        path.append(int(before[path[-1]]))
+    return np.column_stack([u[path], v[path]]).astype(float)

@@ -1,0 +1,125 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Films are cut into episodes: where a hand holds the DLO, from when to when, and what is compared."""
+
+from dataclasses import replace
+
+from filmed_hands import CLOSES, COUNT, filmed_hand, OPENS, RADIUS
+import numpy as np
+import pytest
+
+from dlo_calibration.observation.episodes import episodes, HandSightings, Sightings
+
+
+def joined(*films):
+    """Return the sightings of films one after the other."""
+    seen = Sightings(np.concatenate([film[0].times for film in films]),
+                     np.concatenate([film[0].points for film in films]),
+                     np.concatenate([film[0].cameras for film in films]), RADIUS)
+    hand = HandSightings('hand_1', np.concatenate([film[1].positions for film in films]),
+                         np.concatenate([film[1].orientations for film in films]))
+    return seen, hand
+
+
+@pytest.mark.parametrize('place', [0.0, 0.3, 0.5, 0.98])
+@pytest.mark.parametrize('way, turn', [((0.1, 0.12), 40.0), ((-0.08, 0.0), 0.0)])
+def test_the_hand_and_the_held_point_are_found(place, way, turn):
+    seen, hand, grip = filmed_hand(place, way=way, turn=turn)
+    (episode,), problems = episodes(seen, [hand])
+    assert not problems
+    # Where the hand does not turn, hardly anything distinguishes the held point from its neighbours.
+    assert episode.places[0] == pytest.approx(place, abs=0.03 if turn else 0.05)
+    path, = episode.hands
+    assert CLOSES - 0.5 <= path.start <= CLOSES + 0.15
+    assert OPENS - 0.15 <= path.end <= OPENS + 0.5
+    truth = np.stack([np.interp(path.times, seen.times, axis) for axis in grip.T], axis=1)
+    error = path.positions - truth
+    # Along the DLO, the place of the grip is known to 3 % of the length.
+    assert np.linalg.norm(error - error.mean(axis=0), axis=1).max() < 0.01
+    assert np.linalg.norm(error.mean(axis=0)) < 0.03
+
+
+def test_goals_show_the_moving_dlo_at_its_instants_and_then_its_rest():
+    seen, hand, _ = filmed_hand()
+    (episode,), _ = episodes(seen, [hand])
+    times = np.array([time for time, _ in episode.goals])
+    assert 8 <= episode.moving <= 20
+    assert (times[:episode.moving] <= episode.hands[0].end).all()
+    assert (times[episode.moving:] > episode.hands[0].end).all()
+    assert (np.diff(times) > 0).all()
+    initial = episode.initial.points
+    assert np.abs(initial[:, 0] - 0.6 * np.linspace(0, 1, COUNT)).max() < 0.002
+    assert episode.start < CLOSES < OPENS < episode.end
+
+
+def test_parts_in_the_air_are_left_out():
+    seen, hand, grip = filmed_hand(0.5, lift=0.06)
+    (episode,), _ = episodes(seen, [hand])
+    assert episode.places[0] == pytest.approx(0.5, abs=0.03)
+    path, = episode.hands
+    truth = np.stack([np.interp(path.times, seen.times, axis) for axis in grip.T], axis=1)
+    assert np.abs(path.positions[:, 2] - truth[:, 2]).max() < 0.006
+    high = [(time, points) for time, points in episode.goals[:episode.moving]
+            if np.interp(time, path.times, path.positions[:, 2]) > RADIUS + 0.03]
+    assert high
+    for _, points in high:
+        assert np.isnan(points[COUNT // 2 - 7:COUNT // 2 + 7]).all()
+        assert np.isfinite(points[:5]).all()
+    assert np.isfinite(episode.goals[-1][1]).any(axis=1).all()
+
+
+def test_two_movements_make_two_episodes():
+    first = filmed_hand(0.3)
+    seen, hand = joined(first, filmed_hand(0.3, start=7.0, seed=1))
+    cut, problems = episodes(seen, [hand])
+    # The second film begins where the first one began, so that the DLO jumps between them.
+    assert [episode.hands[0].name for episode in cut][:1] == ['hand_1']
+    assert cut[-1].hands[0].start == pytest.approx(7.0 + CLOSES, abs=0.5)
+    assert all('7.0' in problem or '6.9' in problem or '7.1' in problem for problem in problems)
+
+
+def test_two_hands_share_an_episode():
+    seen, one, _ = filmed_hand(0.15, seed=2)
+    other_seen, other, _ = filmed_hand(0.85, way=(-0.05, 0.1), seed=3)
+    rest = filmed_hand(0.15, way=(0.0, 0.0), noise=0.0)[0].points
+    both = np.where(np.linspace(0, 1, COUNT)[None, :, None] < 0.5, seen.points, other_seen.points)
+    assert rest.shape == both.shape
+    cut, problems = episodes(replace(seen, points=both), [one, replace(other, name='hand_2')])
+    assert not problems
+    assert len(cut) == 1
+    assert cut[0].places == pytest.approx((0.15, 0.85), abs=0.04)
+
+
+def test_a_tag_that_passes_by_holds_nothing():
+    seen, hand, _ = filmed_hand(0.3)
+    bystander = filmed_hand(0.9, way=(-0.2, 0.05), seed=4)[1]
+    (episode,), _ = episodes(seen, [replace(bystander, name='hand_2'), hand])
+    assert [path.name for path in episode.hands] == ['hand_1']
+
+
+def test_a_person_may_say_which_point_is_held():
+    seen, _, grip = filmed_hand(0.5, hidden=0)
+    points = seen.points[:, COUNT // 2]
+    rows = np.arange(len(points))
+    known = np.isfinite(points[:, 0])
+    path = np.stack([np.interp(rows, rows[known], axis[known]) for axis in points.T], axis=1)
+    (episode,), problems = episodes(seen, [HandSightings('hand_1', path, place=0.5)])
+    assert not problems
+    assert episode.places == (0.5,)
+    assert episode.hands[0].start == pytest.approx(CLOSES, abs=0.25)
+    assert episode.hands[0].end == pytest.approx(OPENS, abs=0.25)
+
+
+def test_a_movement_without_a_hand_says_what_to_do():
+    seen, _, _ = filmed_hand()
+    cut, problems = episodes(seen, [])
+    assert not cut
+    assert len(problems) == 1
+    assert 'no tag in the film' in problems[0]
+    assert '--held' in problems[0]
+
+
+def test_a_dlo_at_rest_makes_no_episode():
+    seen, hand, _ = filmed_hand(way=(0.0, 0.0))
+    assert episodes(seen, [hand]) == ((), ())

@@ -1,0 +1,137 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Films on the capture page: from a file to trials, by HTTP and in a real browser."""
+
+from browser import browser, Tab
+from capture_page import served
+from filmed_trials import clicks, film_camera, filmed_trials, LENGTH, MASS, Move
+from films import write_film
+import numpy as np
+import pytest
+import time
+
+from dlo_calibration.files.session import read_session
+from dlo_calibration.simulation.compiled import CompiledSimulator
+
+pytestmark = pytest.mark.usefixtures('without_drawings')
+
+SIZE, RATE = (960, 540), 10.0
+CAMERA = film_camera(SIZE)
+
+
+def ramps(count, size=(160, 120)):
+    for k in range(count):
+        yield np.full((size[1], size[0], 3), 20 + 20 * k, np.uint8)
+
+
+@pytest.fixture(scope='module')
+def short(tmp_path_factory):
+    """Give a film in which nothing is."""
+    path = tmp_path_factory.mktemp('short') / 'short.mp4'
+    write_film(path, ramps(8), 10.0)
+    return path
+
+
+@pytest.fixture(scope='module')
+def whole(tmp_path_factory):
+    """Give a film of a trial that browsers can play, and what happens in it."""
+    path, film = tmp_path_factory.mktemp('whole') / 'whole.webm', filmed_trials((Move(12, (0.06, 0.18)),), RATE)
+    write_film(path, film.images(CAMERA), RATE, 'VP80')
+    return path, film
+
+
+def marked(page, identity, time, places):
+    """Put clicks into an image of a film, and follow the DLO."""
+    def edit(document):
+        document['dlo']['mass'] = MASS
+        document['films'][0]['marks'] = [{'time': time, 'clicks': np.asarray(places).tolist()}]
+
+    page.change(edit)
+    page.done('POST', f'api/films/{identity}/follow')
+
+
+def test_a_film_is_kept_played_and_removed(tmp_path, short):
+    with served(tmp_path / 'project') as page:
+        answer = page.done('POST', 'api/films', short.read_bytes(), {'X-Name': 'my%20film.mp4'})
+        entry, = answer['state']['document']['films']
+        assert (entry['id'], entry['name']) == (answer['id'], 'my film.mp4')
+        seen = answer['state']['films'][entry['id']]
+        assert (seen['width'], seen['height']) == (160, 120)
+        assert seen['duration'] == pytest.approx(0.8)
+        assert page.get(f'api/films/{entry["id"]}/video') == short.read_bytes()
+        assert page.get(f'api/films/{entry["id"]}/frame?time=0.4')[:3] == b'\xff\xd8\xff'
+        page.change(lambda document: document.update(films=[]))
+        assert page.state()['films'] == {}
+
+
+def test_what_is_no_film_is_refused_and_leaves_no_file(tmp_path):
+    with served(tmp_path / 'project') as page:
+        code, error = page.refused('POST', 'api/films', b'x' * 1000, {'X-Name': 'notes.mp4'})
+        assert code == 400 and 'film notes.mp4' in error and 'no film' in error
+        assert page.state()['document']['films'] == []
+        assert list((tmp_path / 'project' / 'films').iterdir()) == []
+
+
+def test_clicks_beside_any_dlo_are_a_problem_of_the_film(tmp_path, short):
+    with served(tmp_path / 'project') as page:
+        identity = page.done('POST', 'api/films', short.read_bytes())['id']
+        marked(page, identity, 0.0, [(20, 20), (90, 90)])
+        state = page.until(lambda state: state['films'][identity]['problem'], 'the problem')
+        assert 'board' in state['films'][identity]['problem']
+
+
+@pytest.mark.long
+def test_a_film_becomes_a_trial_that_survives_the_end_of_the_page(tmp_path, whole):
+    path, film = whole
+    with served(tmp_path / 'project') as page:
+        identity = page.done('POST', 'api/films', path.read_bytes())['id']
+        marked(page, identity, 0.0, clicks(film, CAMERA))
+        state = page.until(lambda state: state['films'][identity].get('trials'), 'the trial')
+        own, = state['films'][identity]['trials']
+        hand, = own['hands']
+        assert hand['place'] == pytest.approx(12 / 60, abs=0.03)
+        assert hand['closes'] == pytest.approx(film.holds[0][0], abs=0.25)
+        trial, = state['trials']
+        assert trial['complete']
+        (tmp_path / 'session.mcap').write_bytes(page.get('api/files/session.mcap'))
+        recorded, = read_session(tmp_path / 'session.mcap').trials
+        assert recorded.initial.length == pytest.approx(LENGTH, rel=0.02)
+        line = page.done('GET', f'api/films/{identity}/line')
+        assert len(line['times']) == len(film.times)
+        page.change(lambda document: document['films'][0].update(left_out=[0]))
+        assert page.state()['trials'] == []
+        page.change(lambda document: document['films'][0].update(left_out=[]))
+    with served(tmp_path / 'project') as page:  # it is followed again by itself
+        state = page.until(lambda state: state['films'][identity].get('trials'), 'the trial')
+        assert state['films'][identity]['trials'] == [own]
+
+
+@pytest.mark.long
+def test_a_person_drops_a_film_clicks_calibrates_and_sees_the_simulated_dlo_on_it(tmp_path, whole):
+    path, film = whole
+    with browser() as started, served(tmp_path / 'project', '--evaluations', 40, '--calibrate', 'flexibility',
+                                      'friction', simulator=CompiledSimulator) as server:
+        tab = Tab(started, server.address)
+        tab.find('input[type=file][accept*="video"]').set_input_files(str(path))
+        tab.button('Follow the DLO').wait_for()
+        tab.page.wait_for_function("document.querySelector('video').readyState >= 2")
+        box = tab.find('#stage').bounding_box()
+        place = tab.page.evaluate('getComputedStyle(document.querySelector("#pictures")).transform')
+        scale, _, _, _, left, top = map(float, place[7:-1].split(','))
+        for u, v in clicks(film, CAMERA, 3):
+            tab.page.mouse.click(box['x'] + left + u * scale, box['y'] + top + v * scale)
+        tab.find('#drawn .mark').nth(2).wait_for()
+        tab.button('Follow the DLO').click()
+        tab.find('text=Use this trial').wait_for()
+        tab.field('Mass of the DLO').fill('30')
+        tab.page.keyboard.press('Tab')
+        tab.button('Next: Calibrate').click()
+        tab.page.get_by_role('button', name='Calibrate', exact=True).last.click()
+        tab.find('section[aria-label=Result]').wait_for()
+        tab.button('Watch').click()
+        tab.field('Time of the film').fill(str(round(film.holds[0][1], 1)))
+        tab.find('#drawn .simulated').wait_for()
+        assert tab.find('#drawn .sure').count()
+        assert not tab.complaints
+        tab.close()

@@ -1,0 +1,196 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The session of the tracker, behind a graph without ROS: images in, chains and actions out."""
+
+import time
+
+import cv2
+from filmed_trials import clicks, film_camera, filmed_trials, Move, RADIUS
+from films import Instant, plain_look, Renderer
+from laid_board import LaidBoard
+import numpy as np
+from photographs import Camera
+import pytest
+from toy_graph import ToyNode, TYPES
+
+from dlo_calibration import InputError
+from dlo_calibration.messages.codec import NANOSECONDS
+from dlo_calibration.ros.tracker_session import INPUT_TYPES, OUTPUT_TYPES, TrackerOptions, TrackerSession
+
+SIZE = (640, 480)
+CAMERA = Camera(SIZE, 700.0, tilt=0.35, distance=0.8, target=(0.09, 0.03))
+BLUE = (0.10, 0.24, 0.55)
+ALONG = np.linspace(0.0, 1.0, 101)
+START = 1_700_000_000 * NANOSECONDS
+
+
+def curve(way=0.0):
+    """Return a DLO that has moved some way towards y [m]."""
+    return np.column_stack([0.4 * ALONG, 0.03 * np.sin(6 * ALONG) + way, np.full(101, RADIUS)])
+
+
+BOARD = LaidBoard((-0.25, -0.12))
+RENDERER = Renderer(plain_look(sheets=(BOARD.sheet,), colour=BLUE), RADIUS)
+
+
+def pixels(way=0.0):
+    """Return an image of the DLO and the board."""
+    return RENDERER.image([Instant(CAMERA, curve(way))])
+
+
+def points(count=4):
+    """Return the parameter `points` of a person who clicks on the DLO."""
+    places = CAMERA.project(curve()[np.linspace(0, 100, count).astype(int)])
+    return ' '.join(f'{u:.0f},{v:.0f}' for u, v in places)
+
+
+def raw(image, stamp):
+    """Return the message of an image."""
+    return TYPES.build('sensor_msgs/msg/Image', header=TYPES.header(stamp, 'camera'), height=image.shape[0],
+                       width=image.shape[1], encoding='rgb8', is_bigendian=0, step=3 * image.shape[1],
+                       data=TYPES.octets(image.tobytes()))
+
+
+def compressed(image, stamp):
+    """Return the message of an image as JPEG."""
+    octets = cv2.imencode('.jpg', image[..., ::-1])[1].tobytes()
+    return TYPES.build('sensor_msgs/msg/CompressedImage', header=TYPES.header(stamp, 'camera'), format='jpeg',
+                       data=TYPES.octets(octets))
+
+
+class TrackerGraph(ToyNode):
+    """The graph of a tracker's session."""
+
+    def __init__(self, **options):
+        super().__init__('tracker', INPUT_TYPES, OUTPUT_TYPES)
+        self.set = options
+        self.session = TrackerSession(self, TYPES, self.clock)
+
+    def options(self):
+        return TrackerOptions.of(self.set)
+
+    def show(self, kind, message):
+        """Send an image, and wait until it is tracked or refused."""
+        before = int(self.status['tracked']), self.status['last_refusal'], self.status['state']
+        self.send([(kind, message)])
+        self.until(lambda: (int(self.status['tracked']), self.status['last_refusal'],
+                            self.status['state']) != before)
+
+
+@pytest.fixture
+def graph():
+    made = []
+
+    def make(**options):
+        made.append(TrackerGraph(**options))
+        return made[-1]
+    yield make
+    for each in made:
+        each.session.close()
+
+
+def xyz(cloud):
+    table = np.frombuffer(cloud.data, np.dtype([('x', '<f8'), ('y', '<f8'), ('z', '<f8')]))
+    return np.stack([table['x'], table['y'], table['z']], axis=1)
+
+
+def test_chains_have_the_stamps_of_the_images_and_lie_on_the_dlo(graph):
+    node = graph(points=points())
+    assert node.status['state'] == 'waiting'
+    node.session.status_period = 0.0
+    for k, way in enumerate((0.0, 0.004, 0.008)):
+        kind, message = ('image', raw) if k % 2 == 0 else ('image/compressed', compressed)
+        node.show(kind, message(pixels(way), START + k * NANOSECONDS // 15))
+    clouds = node.heard['chain']
+    assert [cloud.header.stamp.nanosec for cloud in clouds] == [0, 66666666, 133333333]
+    assert {cloud.header.frame_id for cloud in clouds} == {'table'}
+    truth = BOARD.seen_from(curve(0.008))[::5]
+    found = xyz(clouds[-1])
+    assert found.shape == (21, 3)
+    assert np.nanmean(np.linalg.norm(found - truth, axis=1)) < 0.003
+    assert node.status['state'] == 'tracking'
+    assert node.heard['overlay/compressed']
+    picture = cv2.imdecode(np.asarray(node.heard['overlay/compressed'][-1].data, np.uint8), cv2.IMREAD_COLOR)
+    assert picture.shape[1] == 640
+
+
+def test_without_points_nothing_is_tracked_and_start_says_what_is_missing(graph):
+    node = graph()
+    assert 'points' in node.status['detail']
+    done, answer = node.session.request('start')
+    assert not done
+    assert 'points' in answer
+
+
+def test_stop_rests_and_start_finds_the_dlo_anew(graph):
+    node = graph(points=points())
+    node.session.status_period = 0.0
+    node.show('image', raw(pixels(), START))
+    assert node.session.request('stop')[0]
+    assert node.status['state'] == 'stopped'
+    assert not node.session.request('stop')[0]
+    node.send([('image', raw(pixels(), START + NANOSECONDS))])
+    assert node.session.request('start')[0]
+    node.show('image', raw(pixels(), START + 2 * NANOSECONDS))
+    assert node.status['state'] == 'tracking'
+
+
+def test_an_image_without_the_board_is_refused_with_the_remedy(graph):
+    node = graph(points=points())
+    node.session.status_period = 0.0
+    node.show('image', raw(np.full((480, 640, 3), 128, np.uint8), START))
+    assert 'board' in node.status['last_refusal']
+    node.show('image', raw(pixels(), START + NANOSECONDS))
+    assert node.status['state'] == 'tracking'
+
+
+def test_damaged_images_and_other_encodings_are_refused(graph):
+    node = graph(points=points())
+    node.session.status_period = 0.0
+    message = raw(pixels(), START)
+    message.encoding = 'rgb16'
+    node.show('image', message)
+    assert 'encoding' in node.status['last_refusal']
+    node.session.hear('image', b'\1\2\3')
+    node.until(lambda: 'do not decode' in node.status['last_refusal'])
+
+
+def test_images_that_come_faster_than_they_are_tracked_are_dropped(graph):
+    node = graph(points=points())
+    node.session.status_period = 0.0
+    message = raw(pixels(), START)
+    for _ in range(20):
+        node.send([('image', message)])
+    node.until(lambda: int(node.status['tracked']) > 0)
+    assert int(node.status['images']) == 20
+    assert int(node.status['dropped']) > 5
+
+
+@pytest.mark.parametrize('text', ['1,2 3', 'a,b', '1,2,3 4,5,6', '1,nan 2,3'])
+def test_points_of_another_form_are_refused(text):
+    with pytest.raises(InputError, match='points'):
+        TrackerOptions.of({'points': text})
+
+
+@pytest.mark.long
+def test_a_hand_with_a_tag_gives_an_action_and_where_the_dlo_was_before(graph):
+    camera = film_camera((960, 720))
+    film = filmed_trials((Move(12, (0.06, 0.18)),), rate=15.0)
+    node = graph(points=' '.join(f'{u:.0f},{v:.0f}' for u, v in clicks(film, camera)))
+    node.session.status_period = 0.0
+    for k, image in enumerate(film.images(camera, colour=BLUE)):
+        node.show('image', raw(image, START + round(film.times[k] * NANOSECONDS)))
+    deadline = time.monotonic() + 10
+    while not node.heard['action'] and time.monotonic() < deadline:
+        node.session.tick()
+    action, = node.heard['action']
+    initial, = node.heard['initial_chain']
+    (closes, opens, _), = film.holds
+    start = action.header.stamp.sec - 1_700_000_000 + action.header.stamp.nanosec / 1e9
+    assert abs(start - closes) < 0.3
+    assert abs(start + action.points[-1].time_from_start.sec
+               + action.points[-1].time_from_start.nanosec / 1e9 - opens) < 0.4
+    assert list(action.joint_names) == ['hand_1']
+    assert initial.header.stamp.sec + initial.header.stamp.nanosec / 1e9 < (
+        action.header.stamp.sec + action.header.stamp.nanosec / 1e9)
