@@ -22,6 +22,7 @@ CURVATURES = {'rest_curvature_x1': 56.0, 'rest_curvature_y1': 47.0, 'rest_curvat
               'rest_curvature_y2': 54.0, 'rest_curvature_x3': 46.0, 'rest_curvature_y3': 44.0}
 REST_SHAPE = {'flexibility': 40.0, 'torsion': 60.0, 'clamp_twist': 52.0, **CURVATURES}
 
+STRANDS = {'flexibility': 45.0, 'torsion': 60.0, 'bending_friction': 45.0, 'bending_slip': 50.0}
 
 
 def calibrated(trials, budget=200, names=EVEN.free, parts=0, **rest):
@@ -92,6 +93,33 @@ def test_a_straight_dlo_stays_straight():
     straight = {'flexibility': 40.0, 'torsion': 60.0}
     result = calibrated(observed(ParameterSpace(tuple(straight)), straight), names=tuple(straight))
     assert result.space.free == tuple(straight)
+
+
+def test_a_cable_that_locks_is_found():
+    locks = {**STRANDS, 'locking': 62.0}
+    result = calibrated(observed(ParameterSpace(tuple(locks)), locks), budget=800, names=tuple(STRANDS))
+    assert result.stop_reason.endswith('; it locks; 1 part')
+    for name, value in locks.items():
+        assert result.values[name] == pytest.approx(value, abs=3.0), name
+    assert 'locking' in result.evaluations[0].values  # of the DLO that does not lock
+    assert result.evaluations[0].values['locking'] == 0
+
+
+@pytest.mark.long
+def test_a_cable_that_is_curved_and_locks_is_found():
+    locks = {**STRANDS, 'locking': 62.0, 'clamp_twist': 52.0, **CURVATURES}
+    result = calibrated(observed(ParameterSpace(tuple(locks)), locks), budget=800, names=tuple(STRANDS))
+    assert result.space.knots == 3
+    for name, value in locks.items():
+        assert result.values[name] == pytest.approx(value, abs=1.0), name
+
+
+def test_a_rod_whose_errors_have_another_cause_does_not_lock():
+    damped = {'flexibility': 45.0, 'torsion': 60.0, 'damping': 65.0}
+    result = calibrated(observed(ParameterSpace(tuple(damped)), damped), budget=800, names=tuple(STRANDS))
+    assert result.errors.mean > 4e-3  # much more than noise
+    assert 'locking would' in result.stop_reason
+    assert 'locking' not in result.values
 
 
 @pytest.mark.parametrize('first, kept', [((-0.8, -0.6, -0.3, 0.5), 3), ((0.1, 0.1, 0.1, 0.1), 0)])
