@@ -45,7 +45,6 @@ from dlo_calibration.search.descent import Descent
 STEP = 0.015  # of the finite differences by new parameters, in the unit cube
 MOST_COARSE = 6  # evaluations per parameter for a coarse search
 LEAST_SHARE = 0.04  # of the cost: new parameters that explain less cannot lower the error by 2 %
-
 BEGINNINGS = (0.03, 0.1, 0.3)  # m; bend radii from the best of which a search of locking begins
 
 #: Returns a finer space, and its point for the same DLO.
@@ -54,7 +53,7 @@ Finer = Callable[[ParameterSpace, Floats], tuple[ParameterSpace, Floats]]
 
 def refine(setting: Setting, uniform: Fit, budget: int) -> Fit:
     """
-    Add knots to the rest shape, then halve all parts, while that improves the cross-validation error.
+    Add knots to the rest shape, also with locking, then halve all parts, while cross-validation improves.
 
     Cross-validation predicts each trial from the others (Stone, Cross-validatory choice, 1974), so that
     what only fits noise is rejected. Nothing is tried if noise alone explains the residuals, or if the
