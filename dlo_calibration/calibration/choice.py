@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Sequence
 
 from dlo_calibration.calibration.options import AUTO, Options
-from dlo_calibration.model.parameters import PAPER_PARAMETERS
+from dlo_calibration.model.parameters import LOCKING, PAPER_PARAMETERS, ParameterSpace
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.excitation import motions
 from dlo_calibration.observation.grips import GripEvidence
@@ -59,7 +59,8 @@ def choose(trials: Sequence[Trial], options: Options, evidence: GripEvidence | N
             options = Options.of({**options.flat(), **errors})
             words += f' Corrected: {", ".join(errors)}, because {evidence.words(errors)}.'
     if options.evaluations == 0:
-        rounds = budget(options.space.dimension) + REFINEMENT * chooses_parts(trials, options)
+        ladders = chooses_parts(trials, options) * (1 + may_lock(options.space))
+        rounds = budget(options.space.dimension) + REFINEMENT * ladders
         options = replace(options, evaluations=rounds)
     return Choice(options, words, tuple(errors))
 
@@ -68,6 +69,11 @@ def chooses_parts(trials: Sequence[Trial], options: Options) -> bool:
     """Tell whether cross-validation over the trials chooses rest shape and number of parts."""
     return (options.parts == 0 and options.search == LeastSquares.name and len(trials) > 1
             and 'flexibility' in options.space.free)
+
+
+def may_lock(space: ParameterSpace) -> bool:
+    """Tell whether cross-validation chooses if a DLO locks: friction between its strands is calibrated."""
+    return 'bending_friction' in space.free and LOCKING not in space.free and not space.fixed.get(LOCKING)
 
 
 def budget(dimension: int) -> int:

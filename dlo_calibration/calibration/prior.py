@@ -12,7 +12,7 @@ import numpy as np
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.model.parameters import BY_NAME, HANDS, ParameterSpace, SCALE
+from dlo_calibration.model.parameters import BY_NAME, HANDS, LOCKING, ParameterSpace, SCALE
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.estimate import start_point
 from dlo_calibration.observation.excitation import excites
@@ -23,7 +23,7 @@ from dlo_calibration.search import Hints
 #: stiffness: from random points, a search among many parameters rarely finds the friction between strands,
 #: because strong damping explains the trials nearly as well.
 CABLE = {'elasticity': 100.0, 'damping': 0.3, 'internal_damping': 0.004, 'torsion': 2 / 3,
-         'bending_friction': 1.0, 'bending_slip': 0.5}
+         'bending_friction': 1.0, 'bending_slip': 0.5, LOCKING: 0.1}
 
 #: The parameter of the radius, which the height of the resting DLO gives even without self-contact.
 GUESSED = 'self_collision'

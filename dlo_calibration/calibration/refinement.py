@@ -14,21 +14,28 @@ from concurrent.futures import CancelledError
 from dataclasses import replace
 from functools import partial
 import math
+from operator import itemgetter
 from typing import Callable, Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_calibration.calibration.choice import may_lock
 from dlo_calibration.calibration.fit import Fit, fit
 from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.evaluation.linearisation import Differences, Linearisation, WIDEST
 from dlo_calibration.evaluation.residuals import Huber, ResidualLayout
-from dlo_calibration.inference.cross_validation import left_out_errors, predicts_better
+from dlo_calibration.inference.cross_validation import (
+    LEAST_GAIN,
+    left_out_errors,
+    log_gains,
+    predicts_better,
+)
 from dlo_calibration.inference.uncertainty import noise_alone
 from dlo_calibration.model.chain import Floats, frozen_array
-from dlo_calibration.model.parameters import BY_NAME, KNOTS, MOST_PARTS, ParameterSpace, SCALE
+from dlo_calibration.model.parameters import BY_NAME, KNOTS, LOCKING, MOST_PARTS, ParameterSpace, SCALE
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.material import clamp_twist, clamps
 from dlo_calibration.observation.noise import noise
@@ -38,6 +45,7 @@ from dlo_calibration.search.descent import Descent
 STEP = 0.015  # of the finite differences by new parameters, in the unit cube
 MOST_COARSE = 6  # evaluations per parameter for a coarse search
 LEAST_SHARE = 0.04  # of the cost: new parameters that explain less cannot lower the error by 2 %
+BEGINNINGS = (0.03, 0.1, 0.3)  # m; bend radii from the best of which a search of locking begins
 
 #: Returns a finer space, and its point for the same DLO.
 Finer = Callable[[ParameterSpace, Floats], tuple[ParameterSpace, Floats]]
@@ -45,7 +53,7 @@ Finer = Callable[[ParameterSpace, Floats], tuple[ParameterSpace, Floats]]
 
 def refine(setting: Setting, uniform: Fit, budget: int) -> Fit:
     """
-    Add knots to the rest shape, then halve all parts, while that improves the cross-validation error.
+    Add knots to the rest shape, also with locking, then halve all parts, while cross-validation improves.
 
     Cross-validation predicts each trial from the others (Stone, Cross-validatory choice, 1974), so that
     what only fits noise is rejected. Nothing is tried if noise alone explains the residuals, or if the
@@ -69,8 +77,10 @@ def refine(setting: Setting, uniform: Fit, budget: int) -> Fit:
     ladder, words = _Ladder(setting, replace(uniform, model=model), budget), []
     if _shows_rest_shape(trials, space):
         twist = clamp_twist(trials)
-        why = ladder.climb([(knots, partial(_with_knots, knots, twist))
-                            for knots in KNOTS if knots > space.knots])
+        rungs = [(knots, partial(_with_knots, knots, twist)) for knots in KNOTS if knots > space.knots]
+        why = ladder.climb(rungs)
+        if may_lock(space):
+            why += ladder.lock(rungs)
         knots = ladder.best.space.knots
         words.append((f'rest shape with {knots} knots' if knots else 'straight') + why)
     counts = [space.parts * 2**k for k in range(1, 4) if space.parts * 2**k <= MOST_PARTS]
@@ -101,40 +111,75 @@ class _Ladder:
 
     def climb(self, rungs: Iterable[tuple[int, Finer]]) -> str:
         """
-        Try rungs, each from the previous one, until two of them are no improvement.
+        Try rungs, each from the previous one, until two of them predict no better than the best.
 
-        A single one may mislead: two parts do not show that a DLO is stiff in the middle, four do.
+        A single one may mislead: two parts do not show that a DLO is stiff in the middle, four do. One that
+        predicts better, but not significantly, is not kept; nor does it count as a failure.
 
         :param rungs: the number of knots or parts of each, and how to refine a space.
         :returns: why it ended, in words; empty if there is no finer rung.
         """
-        why, latest, missed = '', self.best, False
+        why, latest, missed = '', self.best, 0
         for count, finer in rungs:
             if _explained(self._setting.trials, self.best):
                 break
-            space, start = finer(latest.space, latest.best.point)
+            space, _ = finer(latest.space, latest.best.point)
             if self._budget - self._spent < 2 * space.dimension:
                 return f': the rest of the budget is too small to try {count}'
             try:
-                stage = self._fitted(space, start, finer, latest)
+                stage = self._fitted(latest, finer)
                 errors = None if stage is None else self._fold_errors(stage)
             except CancelledError:
                 return f': stopped before {count} were fitted'
             except SimulationError:  # the fit of the coarser space remains valid
                 return f': {count} could not be simulated'
-            latest = stage or latest
+            latest, promising = stage or latest, False
             if stage is not None and errors is not None:
                 if self._best_errors is None:
                     self._best_errors = self._fold_errors(self.best)
                 if predicts_better(errors, self._best_errors):
                     self.best, self._best_errors, why = stage, errors, ''
                     continue
+                promising = log_gains(errors, self._best_errors).mean() > LEAST_GAIN
             why = f': {count} would explain too little' if stage is None else \
                 f': {count} would not predict left-out trials better'
-            if missed:
+            missed += not promising
+            if missed == 2:
                 break
-            missed = True
         return why
+
+    def lock(self, rungs: Sequence[tuple[int, Finer]]) -> str:
+        """
+        Climb a second time, with locking; keep where that leads if it predicts better than the best so far.
+
+        A DLO that locks has another rest shape, so that only the ends of both climbs can be compared. The
+        second one begins at the uniform DLO, and ends there if locking does not lower the cost.
+
+        :returns: the outcome in words; empty if it was not tried.
+        """
+        if _explained(self._setting.trials, self.best):
+            return ''
+        uniform = self._tried[0]
+        if self._budget - self._spent < 2 * (uniform.space.dimension + 1):
+            return '; the rest of the budget is too small to try locking'
+        best, errors = self.best, self._best_errors
+        try:
+            locked = self._fitted(uniform, *(partial(_with_locking, radius) for radius in BEGINNINGS))
+            if locked is None or _cost(locked, uniform) > (1 - LEAST_SHARE) * _cost(uniform, uniform):
+                return '; locking would explain too little'
+            errors = self._fold_errors(best) if errors is None else errors
+            self.best, self._best_errors = locked, None
+            self.climb(rungs)
+            if self._best_errors is None:
+                self._best_errors = self._fold_errors(self.best)
+        except (CancelledError, SimulationError) as error:
+            self.best, self._best_errors = best, errors
+            return '; stopped before locking was fitted' if isinstance(error, CancelledError) else \
+                '; locking could not be simulated'
+        if predicts_better(self._best_errors, errors):
+            return '; it locks'
+        self.best, self._best_errors = best, errors
+        return '; locking would not predict left-out trials better'
 
     def outcome(self, words: str) -> Fit:
         """Return the best fit with all evaluations, in its space."""
@@ -143,16 +188,34 @@ class _Ladder:
             _restated(evaluation, tried.space, space)
             for tried in self._tried for evaluation in tried.evaluations))
 
-    def _fitted(self, space: ParameterSpace, start: Floats, finer: Finer, coarse: Fit) -> Fit | None:
+    def _fitted(self, coarse: Fit, *finers: Finer) -> Fit | None:
         """
         Return the fit in a finer space than that of `coarse`; None if it would explain too little.
 
+        :param finers: of several beginnings in this space, the search starts at the most promising one.
         :raises SimulationError: if it cannot be simulated.
         :raises CancelledError: when stopped.
         """
         assert coarse.model is not None
-        before = coarse.model.residuals
+        begun = [self._begun(coarse, finer) for finer in finers]
+        cost, space, here = min(((here.predicted(here.step(WIDEST)), space, here) for space, here in begun),
+                                key=itemgetter(0))
+        if cost > (1 - LEAST_SHARE) * here.loss.cost(coarse.model.residuals):
+            return None
+        search = LeastSquares(space.dimension, 0, Hints.at(here.point, here.jacobian, coarse=True))
+        spent = self._spent
+        finest = fit(self._setting, space, search,
+                     min(self._budget - spent, MOST_COARSE * space.dimension), first=spent)
+        self._tried.append(finest)
+        if finest.stopped:
+            raise CancelledError
+        return None if finest.model is None else finest
+
+    def _begun(self, coarse: Fit, finer: Finer) -> tuple[ParameterSpace, Descent]:
+        """Return a finer space than that of `coarse`, and the beginning of a descent in it."""
+        assert coarse.model is not None
         point, units = coarse.best.point, np.eye(coarse.space.dimension)
+        space, start = finer(coarse.space, point)
         # The coarse model is the fine one, restricted to the points of a linear map.
         nested = np.stack([(finer(coarse.space, point + STEP * unit)[1] - start) / STEP
                            for unit in units], axis=1)
@@ -162,17 +225,7 @@ class _Ladder:
         model = _linearised(self._setting, space, start, new)  # of new parameters only
         jacobian = model.jacobian.copy()
         jacobian[:, old] = coarse.model.jacobian - jacobian[:, new] @ nested[new]
-        here = Descent(start, model.residuals, Huber.of(before), jacobian)
-        if here.predicted(here.step(WIDEST)) > (1 - LEAST_SHARE) * here.loss.cost(before):
-            return None
-        search = LeastSquares(space.dimension, 0, Hints.at(start, jacobian, coarse=True))
-        spent = self._spent
-        finest = fit(self._setting, space, search,
-                     min(self._budget - spent, MOST_COARSE * space.dimension), first=spent)
-        self._tried.append(finest)
-        if finest.stopped:
-            raise CancelledError
-        return None if finest.model is None else finest
+        return space, Descent(start, model.residuals, Huber.of(coarse.model.residuals), jacobian)
 
     def _fold_errors(self, fit: Fit) -> Floats:
         """Return the (f,) mean point error [m] of each fold of the cross-validation."""
@@ -209,6 +262,12 @@ def _with_knots(count: int, twist: float, space: ParameterSpace, point: Floats
     return shaped, start
 
 
+def _with_locking(radius: float, space: ParameterSpace, point: Floats) -> tuple[ParameterSpace, Floats]:
+    fixed = {name: value for name, value in space.fixed.items() if name != LOCKING}
+    return replace(space, free=(*space.free, LOCKING), fixed=fixed), \
+        np.append(point, BY_NAME[LOCKING].value(radius) / SCALE)
+
+
 def _with_parts(count: int, space: ParameterSpace, point: Floats) -> tuple[ParameterSpace, Floats]:
     while space.parts < count:
         space, point = space.halved(point)
@@ -225,11 +284,19 @@ def _shows_rest_shape(trials: Sequence[Trial], space: ParameterSpace) -> bool:
 def _restated(evaluation: Evaluation, tried: ParameterSpace, space: ParameterSpace) -> Evaluation:
     """Return an evaluation in another space: the same DLO, except for parameters that the space lacks."""
     tried, point = _with_parts(space.parts, tried, evaluation.point)
+    if LOCKING in space.free and LOCKING not in tried.free:
+        tried, point = _with_locking(0.0, tried, point)
     if tried.knots != space.knots and space.knots:
         tried, point = tried.with_knots(space.knots, point)
     values = tried.values(point)
     return replace(evaluation, point=frozen_array(space.point(values)),
                    values={name: values[name] for name in space.free})
+
+
+def _cost(fit: Fit, other: Fit) -> float:
+    """Return the cost [m^2] of the residuals of a fit, by the loss of another one."""
+    assert fit.model is not None and other.model is not None
+    return Huber.of(other.model.residuals).cost(fit.model.residuals)
 
 
 def _explained(trials: Sequence[Trial], fit: Fit) -> bool:

@@ -237,6 +237,8 @@ class _MjcfWriter:
                          f'times EI, which slip at {rope.bending_slip:.3g} 1/m')
         if any(obstacle.shape == 'mesh' for obstacle in rope.obstacles):
             lines.append('dents and holes of meshes among the obstacles: MuJoCo touches their convex hulls')
+        if rope.locking > 0:
+            lines.append(f'locking: EI has doubled at a bend radius of {measured(rope.locking, "m")}')
         if rope.clamp_twist:
             lines.append(f'the angle of the second clamp, {rope.clamp_twist:.3g} rad')
         return lines

@@ -51,6 +51,7 @@ class ExportedRope:
     :param friction: Coulomb coefficient of the DLO with the table and with itself.
     :param bending_friction: largest moment of friction between strands, relative to EI [1/m]; 0: none.
     :param bending_slip: change of curvature at which they slip [1/m].
+    :param locking: bend radius at which EI has doubled [m]; 0: none.
     :param table: height of the table [m]; None: there is none.
     :param obstacles: of the scene.
     :param point_places: (m,) arc lengths of the points of the chain at rest [m], from 0.
@@ -74,6 +75,7 @@ class ExportedRope:
     friction: float
     bending_friction: float
     bending_slip: float
+    locking: float
     table: float | None
     obstacles: tuple[Obstacle, ...]
     point_places: Floats
@@ -153,6 +155,7 @@ class ExportedRope:
             internal_damping=physical['internal_damping'], friction=physical['friction'],
             bending_friction=physical.get('bending_friction', 0.0),
             bending_slip=physical.get('bending_slip', 0.0),
+            locking=physical.get('locking', 0.0),
             table=None if not options.table else options.table_height if level is None else level - radius,
             obstacles=obstacles_of(options),
             point_places=frozen_array(chain.arc_lengths() * lengths.sum() / places[-1]),

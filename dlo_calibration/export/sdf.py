@@ -217,6 +217,8 @@ def _about(rope: ExportedRope) -> list[str]:
     if any(obstacle.friction > 1 for obstacle in rope.obstacles):
         lines.append('Not kept: obstacles with a friction above 1, as DART takes the smaller coefficient of '
                      'two bodies, here that of the DLO.')
+    if rope.locking > 0:
+        lines.append('Not kept: locking.')
     if not rope.slender:
         lines.append('The segments are shorter than the DLO is thick: self_collide is false, as links that '
                      'are near each other along the DLO would push each other away. Fewer nodes allow it.')

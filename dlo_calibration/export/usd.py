@@ -220,6 +220,8 @@ def _about(rope: ExportedRope, moduli: bool) -> list[str]:
                     'would sag')
     if rope.bending_friction > 0:
         lost.append('friction between strands, bending_friction')
+    if rope.locking > 0:
+        lost.append('locking')
     lines.append(f'Not kept: {"; ".join(lost)}.')
     if not rope.slender:
         lines.append('The segments are shorter than the DLO is thick: collisions with itself are off, as '

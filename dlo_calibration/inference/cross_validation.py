@@ -59,6 +59,11 @@ def left_out_errors(model: Linearisation, layout: ResidualLayout, residuals_at: 
     return errors
 
 
+def log_gains(after: Floats, before: Floats) -> Floats:
+    """Return by how much the logarithm of the error of each fold fell; see `predicts_better`."""
+    return np.asarray(np.log(np.maximum(before, 1e-6) / np.maximum(after, 1e-6)))
+
+
 def predicts_better(after: Floats, before: Floats) -> bool:
     """
     Tell whether the errors of left-out trials became smaller, by at least 2 % and significantly.
@@ -71,7 +76,7 @@ def predicts_better(after: Floats, before: Floats) -> bool:
     """
     from scipy import stats  # takes as long to load as a short search
 
-    gains = np.log(np.maximum(before, 1e-6) / np.maximum(after, 1e-6))
+    gains = log_gains(after, before)
     if len(gains) < 2 or not gains.mean() > LEAST_GAIN:
         return False
     least = stats.t.ppf(1 - CHANCE, len(gains) - 1) * stats.sem(gains)

@@ -135,6 +135,8 @@ class Parameter:
 
 
 MOST_PARTS = 8  # with bending stiffnesses of their own: the DLO can be halved three times
+LOCKING = 'locking'  # name of the parameter of cables that become stiffer as they bend
+MOST_LOCKED = 30.0  # largest stiffening by locking, as in the core
 KNOTS = (3, 5, 9)  # of a rest shape that varies: each number keeps the places of the previous one
 
 
@@ -176,6 +178,8 @@ PARAMETERS: tuple[Parameter, ...] = (
               1e2, 0.0, 'how much of a bend the DLO keeps, by friction between its strands', neutral=0.0),
     Parameter('bending_slip', 'change of curvature at which the strands slip', '1/m', 1e-3, 1e1, 50.0,
               'how far the DLO bends before its strands slip (no effect without bending_friction)'),
+    Parameter(LOCKING, 'bend radius at which the bending stiffness has doubled', 'm', 3e-3, 1e0, 0.0,
+              'how soon a DLO of strands becomes stiffer as it bends (0: never)', neutral=0.0),
     *(Parameter(part_name(part), f'bending stiffness of part {part} relative to part 1', '1', 0.02, 50.0,
                 50.0, f'how stiff part {part} of the DLO is (see parts)', neutral=1.0)
       for part in range(2, MOST_PARTS + 1)),
@@ -443,21 +447,34 @@ def rest_shape(curvatures: Floats, length: float) -> Floats:
     return np.asarray(steps.cumsum(axis=-2))
 
 
-def bending_moments(curvatures: Floats, stiffness: float, friction: float, slip: float) -> Floats:
+def bending_moments(curvatures: Floats, stiffness: float, friction: float, slip: float, locking: float = 0.0
+                    ) -> Floats:
     """
     Return the (m,) moments [N m] while a piece of DLO is bent in one plane.
 
     Strands that rub on each other are an elastic, perfectly plastic element beside the elastic bending (Iwan,
     A distributed-element model for hysteresis, 1966).  So each branch of a cycle is the first one, twice as
     large (Masing, 1926), and a cycle between -a and a takes the energy ``4 EI friction (a - slip)`` of each
-    metre if a is larger than `slip`, and none if it is smaller.
+    metre if a is larger than `slip`, and none if it is smaller.  Locking adds a part that takes no energy.
 
     :param curvatures: (m,) [1/m], from that of the rest shape; at the first, the strands are free of stress.
     :param stiffness: EI [N m^2].
     :param friction: largest moment of the friction between strands, relative to EI [1/m].
     :param slip: change of curvature at which they slip [1/m].
+    :param locking: bend radius at which the elastic part has doubled [m]; 0: none.
     """
     stress = np.zeros(len(curvatures))
     for k, change in enumerate(np.diff(curvatures), start=1):
         stress[k] = np.clip(stress[k - 1] + friction / slip * change, -friction, friction)
-    return stiffness * (curvatures + stress)
+    return stiffness * (_elastic(curvatures, locking) + stress)
+
+
+def kept_curvature(friction: float, locking: float = 0.0) -> float:
+    """Return the curvature [1/m] that stays after a DLO was bent far; parameters as of `bending_moments`."""
+    curvatures = np.linspace(0, friction, 1001)
+    return float(np.interp(friction, _elastic(curvatures, locking), curvatures))
+
+
+def _elastic(curvatures: Floats, locking: float) -> Floats:
+    """Return the elastic moments at (m,) curvatures [1/m], relative to EI."""
+    return np.asarray((1 + np.minimum((locking * curvatures)**2, MOST_LOCKED)) * curvatures)

@@ -14,6 +14,8 @@ from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import (
     bending_moments,
     BY_NAME,
+    kept_curvature,
+    LOCKING,
     measured,
     natural_curvature,
     number,
@@ -60,19 +62,20 @@ def moment_panels(result: CalibrationResult) -> list[Panel]:
     if not keeps_bends(result):
         return []
     physical, space = result.physical(), result.space
-    friction, slip = physical['bending_friction'], physical['bending_slip']
+    friction, slip, locking = (physical[name] for name in ('bending_friction', 'bending_slip', LOCKING))
+    kept = kept_curvature(friction, locking)
     flexibility = result.values.get(
         'flexibility', space.fixed.get('flexibility', BY_NAME['flexibility'].default))
     stiffness, unit = space.reported('flexibility', flexibility)
     # As far as the trials bent it, but so that slip and what stays can be seen.
     reach = float(np.clip(_largest_curvature(result.chains), friction + 3 * slip, 4 * (friction + slip)))
-    largest = stiffness * (reach + friction)
+    largest = float(bending_moments(np.array([0, reach]), stiffness, friction, slip, locking)[-1])
     scale, prefix = next((pair for pair in PREFIXES if largest >= pair[0]), PREFIXES[-1])
     stiffness, unit = stiffness / scale, prefix + unit.replace('N m^2', 'N m')
     first = np.linspace(0, reach, FINE + 1)
     path = np.concatenate([first, np.linspace(reach, -reach, 2 * FINE + 1)[1:],
                            np.linspace(-reach, reach, 2 * FINE + 1)[1:]])
-    moments = bending_moments(path, stiffness, friction, slip)
+    moments = bending_moments(path, stiffness, friction, slip, locking)
 
     def draw(axes: Axes) -> None:
         to, fro = slice(FINE, 3 * FINE + 1), slice(3 * FINE, None)
@@ -82,17 +85,17 @@ def moment_panels(result: CalibrationResult) -> list[Panel]:
         axes.plot(path[fro], moments[fro], color=SIMULATED, linewidth=2, label='while it is bent again')
         axes.axhline(0, color=FAINT, linewidth=0.6, zorder=0.5)
         axes.axvline(0, color=FAINT, linewidth=0.6, zorder=0.5)
-        axes.plot([slip], [stiffness * (slip + friction)], 's', color=OBSERVED, markersize=6,
+        axes.plot([slip], [np.interp(slip, first, moments[:FINE + 1])], 's', color=OBSERVED, markersize=6,
                   label=f'bending_slip: from {measured(slip, "1/m")} on, the strands slip')
-        axes.plot([friction], [0], 'o', color=OBSERVED, markersize=7,
-                  label=f'bending_friction: {measured(friction, "1/m")} stay when it is released')
+        axes.plot([kept], [0], 'o', color=OBSERVED, markersize=7,
+                  label=f'bending_friction: {measured(kept, "1/m")} stay when it is released')
         axes.set(title=f'moment that bends {"part 1" if space.parts > 1 else "it"} to and fro',
                  xlabel='curvature, from that of the rest shape [1/m]', ylabel=f'moment [{unit}]')
         axes.grid(alpha=0.3)
 
     return [panel(draw, (
         f'The moment, up to {number(moments.max())} {unit}, while a piece of the DLO is bent to and fro: '
-        f'{measured(friction, "1/m")} of curvature stay when it is released; the strands slip after '
+        f'{measured(kept, "1/m")} of curvature stay when it is released; the strands slip after '
         f'{measured(slip, "1/m")}'))]
 
 

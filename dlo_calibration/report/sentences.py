@@ -20,7 +20,9 @@ from dlo_calibration.model.chain import Chain, Floats, grip_place
 from dlo_calibration.model.parameters import (
     BY_NAME,
     interval,
+    kept_curvature,
     knot_names,
+    LOCKING,
     measured,
     natural_curvature,
     number,
@@ -269,8 +271,11 @@ def friction_sentences(result: CalibrationResult) -> list[str]:
     physical, unsure = result.physical(), _verdict(result, 'bending_friction') == WEAK
     slips = '' if _verdict(result, 'bending_slip') == NOT_IDENTIFIABLE else (
         f'; they slip where the curvature changes by more than {measured(physical["bending_slip"], "1/m")}')
+    stiffer = '' if not physical[LOCKING] or _verdict(result, LOCKING) == NOT_IDENTIFIABLE else (
+        f' Bent to a radius of {measured(physical[LOCKING], "m")}, it is twice as stiff.')
     return [f'Bent far and released, the DLO {"may keep" if unsure else "keeps"} a curvature of up to '
-            f'{_with_radius(physical["bending_friction"])}, because its strands rub on each other{slips}.']
+            f'{_with_radius(kept_curvature(physical["bending_friction"], physical[LOCKING]))}, because its '
+            f'strands rub on each other{slips}.{stiffer}']
 
 
 def keeps_bends(result: CalibrationResult) -> bool:

@@ -13,7 +13,14 @@ from toy_messages import toy_trials
 from toy_simulator import new_toy
 
 from dlo_calibration import Action, calibrate, Chain, Goal, Hand, Options, Trial
-from dlo_calibration.calibration.choice import BETWEEN_CLAMPS, choose, IN_MOTION, PAPER_ROUNDS, REFINEMENT
+from dlo_calibration.calibration.choice import (
+    BETWEEN_CLAMPS,
+    choose,
+    IN_MOTION,
+    may_lock,
+    PAPER_ROUNDS,
+    REFINEMENT,
+)
 from dlo_calibration.calibration.engines import make_simulator
 from dlo_calibration.experiment.study import Observed
 from dlo_calibration.files.result import read_result, write_result
@@ -94,6 +101,15 @@ def test_more_parameters_get_more_evaluations():
     assert most(parts=8) > 150
     assert most() > most(parts=8)
     assert most(search='random') == most(search='cma_es') == 150  # only least squares goes on to parts
+
+
+def test_only_a_dlo_of_strands_may_lock():
+    assert not may_lock(choose(toy_trials(2), Options()).options.space)
+    trials = [stream(), replace(stream(), name='again')]
+    choice = choose(trials, Options()).options
+    assert may_lock(choice.space) and choice.evaluations == PAPER_ROUNDS + 2 * REFINEMENT
+    for locking in ({'calibrate': (*ALL, 'locking')}, {'calibrate': ALL, 'locking': 30.0}):
+        assert not may_lock(Options.of(locking).space)
 
 
 def test_a_log_serves_the_names_that_auto_stands_for():

@@ -3,11 +3,15 @@
 
 """Refinement: as many knots of the rest shape and parts as the trials support."""
 
+from types import SimpleNamespace
+
 from carried_trials import EVEN, observed, STIFF_MIDDLE, TRUTH
+import numpy as np
 import pytest
 
 from dlo_calibration.calibration.calibrate import fitted
 from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.refinement import _Ladder
 from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.evaluation.evaluation import Evaluator
 from dlo_calibration.model.parameters import ParameterSpace
@@ -17,6 +21,8 @@ CURVED = ParameterSpace(('flexibility', 'torsion')).shaped(3)
 CURVATURES = {'rest_curvature_x1': 56.0, 'rest_curvature_y1': 47.0, 'rest_curvature_x2': 53.0,
               'rest_curvature_y2': 54.0, 'rest_curvature_x3': 46.0, 'rest_curvature_y3': 44.0}
 REST_SHAPE = {'flexibility': 40.0, 'torsion': 60.0, 'clamp_twist': 52.0, **CURVATURES}
+
+STRANDS = {'flexibility': 45.0, 'torsion': 60.0, 'bending_friction': 45.0, 'bending_slip': 50.0}
 
 
 def calibrated(trials, budget=200, names=EVEN.free, parts=0, **rest):
@@ -87,6 +93,47 @@ def test_a_straight_dlo_stays_straight():
     straight = {'flexibility': 40.0, 'torsion': 60.0}
     result = calibrated(observed(ParameterSpace(tuple(straight)), straight), names=tuple(straight))
     assert result.space.free == tuple(straight)
+
+
+def test_a_cable_that_locks_is_found():
+    locks = {**STRANDS, 'locking': 62.0}
+    result = calibrated(observed(ParameterSpace(tuple(locks)), locks), budget=800, names=tuple(STRANDS))
+    assert result.stop_reason.endswith('; it locks; 1 part')
+    for name, value in locks.items():
+        assert result.values[name] == pytest.approx(value, abs=3.0), name
+    assert 'locking' in result.evaluations[0].values  # of the DLO that does not lock
+    assert result.evaluations[0].values['locking'] == 0
+
+
+@pytest.mark.long
+def test_a_cable_that_is_curved_and_locks_is_found():
+    locks = {**STRANDS, 'locking': 62.0, 'clamp_twist': 52.0, **CURVATURES}
+    result = calibrated(observed(ParameterSpace(tuple(locks)), locks), budget=800, names=tuple(STRANDS))
+    assert result.space.knots == 3
+    for name, value in locks.items():
+        assert result.values[name] == pytest.approx(value, abs=1.0), name
+
+
+def test_a_rod_whose_errors_have_another_cause_does_not_lock():
+    damped = {'flexibility': 45.0, 'torsion': 60.0, 'damping': 65.0}
+    result = calibrated(observed(ParameterSpace(tuple(damped)), damped), budget=800, names=tuple(STRANDS))
+    assert result.errors.mean > 4e-3  # much more than noise
+    assert 'locking would' in result.stop_reason
+    assert 'locking' not in result.values
+
+
+@pytest.mark.parametrize('first, kept', [((-0.8, -0.6, -0.3, 0.5), 3), ((0.1, 0.1, 0.1, 0.1), 0)])
+def test_rungs_that_predict_better_but_not_significantly_do_not_end_a_climb(monkeypatch, first, kept):
+    logarithms = [np.zeros(4), np.array(first), np.array(first), np.full(4, -1.0)]
+    rungs = [SimpleNamespace(space=EVEN, best=SimpleNamespace(point=None), evaluations=(),
+                             errors=np.exp(logarithm)) for logarithm in logarithms]
+    ladder = _Ladder(Setting(tuple(observed(EVEN, TRUTH)), Options(), None), rungs[0], 100)
+    coming = iter(rungs[1:])
+    monkeypatch.setattr('dlo_calibration.calibration.refinement._explained', lambda trials, rung: False)
+    monkeypatch.setattr(ladder, '_fitted', lambda *arguments: next(coming))
+    monkeypatch.setattr(ladder, '_fold_errors', lambda rung: rung.errors)
+    ladder.climb([(count, lambda space, point: (space, point)) for count in (3, 5, 9)])
+    assert ladder.best is rungs[kept]
 
 
 def test_a_small_budget_leaves_the_dlo_even_and_says_so(stiff_middle):

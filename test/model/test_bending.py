@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 from stepping import SteppedRope
 
-from dlo_calibration.model.parameters import bending_moments, natural_curvature, ParameterSpace, rest_shape
+from dlo_calibration.model.parameters import (
+    bending_moments,
+    kept_curvature,
+    natural_curvature,
+    ParameterSpace,
+    rest_shape,
+)
 
 STIFFNESS, FRICTION, SLIP = 2e-3, 1.5, 0.4
 
@@ -69,10 +75,11 @@ def test_a_free_dlo_takes_this_rest_shape():
         np.testing.assert_allclose(seen, drawn, rtol=0.01)
 
 
+@pytest.mark.parametrize('locking', [0.0, 0.3])
 @pytest.mark.parametrize('reach', [0.1, 0.4, 0.5, 3.0])
-def test_a_cycle_takes_the_energy_of_friction(reach):
+def test_a_cycle_takes_the_energy_of_friction(reach, locking):
     curvatures = cycle(reach)
-    moments = bending_moments(curvatures, STIFFNESS, FRICTION, SLIP)
+    moments = bending_moments(curvatures, STIFFNESS, FRICTION, SLIP, locking)
     area = ((moments[400:-1] + moments[401:]) / 2 * np.diff(curvatures[400:])).sum()
     expected = 4 * STIFFNESS * FRICTION * max(reach - SLIP, 0.0)
     assert area == pytest.approx(expected, rel=0.01, abs=1e-9)
@@ -85,8 +92,11 @@ def test_a_branch_of_hysteresis_is_the_first_loading_twice_as_large():
     np.testing.assert_allclose(moments[100] - moments[100:301:2], 2 * first, atol=1e-12)
 
 
-def test_a_dlo_that_was_bent_far_keeps_the_curvature_of_friction():
+@pytest.mark.parametrize('locking', [0.0, 1.0, 10.0])
+def test_a_dlo_that_was_bent_far_keeps_the_curvature_of_friction(locking):
     curvatures = cycle(5.0, 1000)
     unloading = slice(1000, 3001)
-    moments = bending_moments(curvatures, STIFFNESS, FRICTION, SLIP)[unloading]
-    assert np.interp(0.0, -moments, -curvatures[unloading]) == pytest.approx(-FRICTION, abs=5e-3)
+    moments = bending_moments(curvatures, STIFFNESS, FRICTION, SLIP, locking)[unloading]
+    kept = np.interp(0.0, -moments, -curvatures[unloading])
+    assert kept == pytest.approx(-kept_curvature(FRICTION, locking), abs=5e-3)
+    assert kept_curvature(FRICTION) == pytest.approx(FRICTION)

@@ -90,8 +90,8 @@ def test_physical_values_are_free_ones_then_fixed_ones_then_defaults():
 
 def test_more_of_the_object_is_off_by_default_exactly():
     physical = ParameterSpace().physical({}, length=1.0)
-    names = ('length_scale', 'natural_curvature', 'marker_mass', 'torsion', 'bending_friction')
-    assert [physical[name] for name in names] == [1, 0, 0, 0, 0]
+    names = ('length_scale', 'natural_curvature', 'marker_mass', 'torsion', 'bending_friction', 'locking')
+    assert [physical[name] for name in names] == [1, 0, 0, 0, 0, 0]
     parts = ParameterSpace().divided(8).physical({}, length=1.0)
     assert [parts[f'stiffness_{part}'] for part in range(2, 9)] == [1] * 7
     assert BY_NAME['length_scale'].value(1.0) == 50

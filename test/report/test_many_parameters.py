@@ -26,7 +26,7 @@ from dlo_calibration.inference.missing_parameters import MissingParameter
 from dlo_calibration.inference.slices import MOST_LINES, simulate_slices
 from dlo_calibration.inference.uncertainty import IDENTIFIABLE, NOT_IDENTIFIABLE, WEAK
 from dlo_calibration.messages.codec import bag_types
-from dlo_calibration.model.parameters import knot_names
+from dlo_calibration.model.parameters import BY_NAME, knot_names
 from dlo_calibration.planning.dlo import Posterior
 from dlo_calibration.report.bending_drawing import (
     _best_axes,
@@ -123,6 +123,14 @@ def test_friction_between_strands_gives_a_sentence_only_where_it_is_known(result
     assert ' may keep a curvature ' in bend(bending_friction=WEAK)[0]
     words, drawn = bend(bending_friction=IDENTIFIABLE, bending_slip=NOT_IDENTIFIABLE)
     assert ' keeps a curvature ' in words and 'slip' not in words and drawn
+
+
+def test_a_dlo_that_locks_says_at_which_radius(result, without_drawings):
+    fixed = {**result.space.fixed, 'locking': BY_NAME['locking'].value(0.1)}
+    locks = replace(result, space=replace(result.space, fixed=fixed))
+    for dlo, expected in ((result, False), (locks, True)):
+        words, = (text for text in sentences(dlo) if text.startswith('Bent far'))
+        assert words.endswith(' Bent to a radius of 100 mm, it is twice as stiff.') is expected
 
 
 def test_draws_are_whole_ropes_within_the_scale(result):

@@ -99,6 +99,7 @@ def test_rollouts_are_those_of_bullet(name):
         # it is far more curved at rest, and whether strands stick or slip.
         values = {**space.values(generator.random(len(NAMES))), 'length_scale': generator.uniform(30, 48),
                   'natural_curvature': generator.uniform(0, 20), 'bending_friction': 0.0,
+                  'locking': 0.0,
                   **dict(zip(REST_SHAPE[1:], generator.uniform(48, 52, len(REST_SHAPE) - 1), strict=True))}
         physical = {**space.physical(values, trial.initial.length), 'self_collision': 0.004}
         expected, rollout = (engine.simulate(trial, physical) for engine in (bullet, compiled))

@@ -81,7 +81,8 @@ def start(nodes=5, **others):
     return core.Start(**{'places': places, 'points': points, 'velocities': 0 * points, **others})
 
 
-CABLE = properties(1e-3, 1e3, 0.02, 1.0, 0.01, torsion=0.7, natural_curvature=1.0, bending_friction=0.5)
+CABLE = properties(1e-3, 1e3, 0.02, 1.0, 0.01, torsion=0.7, natural_curvature=1.0, bending_friction=0.5,
+                   locking=0.05)
 
 
 @pytest.mark.parametrize('count', [1, 5])

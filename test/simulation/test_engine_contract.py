@@ -37,7 +37,7 @@ SPACE = ParameterSpace(tuple(parameter.name for parameter in PARAMETERS))
 NEUTRAL = {parameter.name: parameter.default for parameter in PARAMETERS[7:]}  # of an even, straight DLO
 MIDDLE = {**dict.fromkeys(SPACE.free, 50.0), 'natural_curvature': 20.0, 'flexibility': 60.0,
           'elasticity': 40.0, 'friction': 60.0, 'self_collision': 25.0, 'damping': 50.0,
-          'internal_damping': 0.0, 'mass': 40.0}
+          'internal_damping': 0.0, 'locking': 0.0, 'mass': 40.0}
 
 
 def each_engine(*names_and_values):

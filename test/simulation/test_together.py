@@ -74,6 +74,7 @@ def test_dlos_that_resist_twist_or_rub_beside_some_that_do_not():
     simulator = CompiledSimulator(table=False, nodes=21)
     sets = [{**physical, **changes} for physical in drawn(CABLES, 2) for changes in (
         {}, {'torsion': 0.0}, {'bending_friction': 0.0}, {'natural_curvature': 0.0},
+        {'locking': 0.1}, {'locking': 0.1, 'bending_friction': 0.0},
         {'torsion': 0.0, 'natural_curvature': 0.0})]
     trials = carried(0.1, 0.2), turned(1.0)
     assert all(same(simulator, [(trial, physical) for physical in sets for trial in trials]))

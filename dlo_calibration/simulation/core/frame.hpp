@@ -79,8 +79,9 @@ inline void find_bishop_frame(Rods<Number>& rods, bool begun) {
 template <class Number>
 inline std::array<Number, 2> mean_direction(const Rods<Number>& rods) {
   Number along{}, across{};
+  const auto* all_natural = natural_now(rods);
   for (std::size_t i = 0; i < rods.joints.size(); ++i) {
-    const auto &natural = rods.natural[i];
+    const auto &natural = all_natural[i];
     const auto &joint = rods.joints[i];
     along = along + (natural.x * joint.x + natural.y * joint.y);
     across = across + (natural.x * joint.y - natural.y * joint.x);
@@ -94,13 +95,14 @@ template <class Number>
 inline void turn_freely(Rods<Number>& rods) {
   const int joints = rods.nodes - 2;
   auto* all_joints = rods.joints.data();
-  const auto* natural = rods.natural.data();
+  const auto* natural = natural_now(rods);
   const auto [a, b] = mean_direction(rods);
   Number total{}, twist{}, slope{};
-  for (const auto& each : rods.natural) total = total + each.size;
-  const Number smallest = kRounded * total / static_cast<double>(rods.natural.size());
-  const Number length = sqrt(a * a + b * b + smallest * smallest);
-  const Number cosine = a / length, sine = b / length;
+  for (int i = 0; i < joints; ++i) total = total + natural[i].size;
+  const Number smallest = kRounded * total / static_cast<double>(joints);
+  const Number ahead = select(total > 0.0, a, 1.0);  // without natural curvature, any direction is right
+  const Number length = sqrt(ahead * ahead + b * b + smallest * smallest);
+  const Number cosine = ahead / length, sine = b / length;
   for (int i = 0; i < joints; ++i) {
     Joint<Number>& joint = all_joints[i];
     joint.cosine = cosine, joint.sine = sine;
@@ -173,8 +175,8 @@ inline void balance_torques(Rods<Number>& rods, const Ropes& ropes, bool begun) 
   auto *prescribed = rods.prescribed.data(), *turning = rods.turning.data(), *upper = rods.upper.data();
   auto *angles = rods.angles.data(), *clamped = rods.clamped.data();
   const auto* twisting = rods.twisting.data();
-  const auto* natural = rods.natural.data();
-  const bool rubs = rods.strands_rub && begun;
+  const auto* natural = natural_now(rods);
+  const bool rubs = strands_turn(rods) && begun;
   const auto* moments = rods.moments.data();
   auto* joints = rods.joints.data();
   const auto holds = [&](const Clamp& clamp) { return begun || std::isfinite(clamp.direction.x); };
@@ -307,6 +309,7 @@ template <class Number>
 inline void add_frame(Rods<Number>& rods, const Ropes& ropes, bool begun, bool rubbed) {
   const bool rubs = strands_turn(rods);
   find_bishop_frame(rods, begun);
+  if (rods.locks) find_stiffening(rods);
   if (!rods.twists) {
     turn_freely(rods);
   } else {
@@ -314,8 +317,10 @@ inline void add_frame(Rods<Number>& rods, const Ropes& ropes, bool begun, bool r
     if (!begun && rubs && rubbed) enter_frame(rods);
     if (rubs) find_moments(rods, rubbed, false);
     balance_torques(rods, ropes, true);
-    if (rubs) find_moments(rods, rubbed, true), add_stiffness(rods);
   }
+  const bool more = rubs || rods.locks;
+  if (rods.locks) find_stiffening(rods);
+  if (more) find_moments(rods, rubbed, true), add_stiffness(rods);
   const int joints = rods.nodes - 2;
   const double step = rods.step;
   const auto *tangents = rods.tangents.data(), *across = rods.across.data();
@@ -333,7 +338,7 @@ inline void add_frame(Rods<Number>& rods, const Ropes& ropes, bool begun, bool r
   for (int i = 0; i < joints; ++i) {
     const Vec3<Number>&a = tangents[i], &b = tangents[i + 1], &u = across[i];
     const Joint<Number>& joint = all_joints[i];
-    const auto [x, y] = turned(rubs ? moments[i].x : natural[i].x, rubs ? moments[i].y : natural[i].y, joint);
+    const auto [x, y] = turned(more ? moments[i].x : natural[i].x, more ? moments[i].y : natural[i].y, joint);
     const Number half_x = joint.half * x, half_y = joint.half * y;
     const Vec3<Number> bend = half_x * u + half_y * cross(a, u);
     const Number share = (half_x * joint.x + half_y * joint.y) * (joint.inverse / 2);

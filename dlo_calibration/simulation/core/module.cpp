@@ -103,7 +103,8 @@ Properties properties_of(const py::object& mapping) {
   properties.natural_curvature = get("natural_curvature", 0.0);
   properties.marker_mass = get("marker_mass", 0.0), properties.torsion = get("torsion", 0.0);
   properties.bending_friction = get("bending_friction", 0.0);
-  properties.bending_slip = get("bending_slip", 0.1), properties.clamp_twist = get("clamp_twist", 0.0);
+  properties.bending_slip = get("bending_slip", 0.1), properties.locking = get("locking", 0.0);
+  properties.clamp_twist = get("clamp_twist", 0.0);
   for (int part = 2; physical.contains("stiffness_" + std::to_string(part)); ++part)
     properties.profile.push_back(need("stiffness_" + std::to_string(part)));
   for (int knot = 1; physical.contains("rest_curvature_x" + std::to_string(knot)); ++knot)
@@ -380,7 +381,7 @@ py::dict state_of(const Rope& rope) {
       "twisting"_a = array_of(rods.twisting), "angles"_a = array_of(rods.angles),
       "bishop"_a = array_of(rods.bishop), "joints"_a = array_of(rods.joints), "clamps"_a = clamps,
       "strands"_a = array_of(rods.strands), "plastic"_a = array_of(rods.plastic),
-      "strand_forces"_a = array_of(rods.strand_forces),
+      "strand_forces"_a = array_of(rods.strand_forces), "locking"_a = array_of(rods.locking),
       "frame_impulses"_a = array_of(rods.frame_impulses));
 }
 

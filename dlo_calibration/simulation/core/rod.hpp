@@ -73,7 +73,7 @@ inline void eliminate(const Column<Number>& done, const std::array<Number, kBand
 template <class Number>
 inline void solve(Rods<Number>& rods) {
   const int n = rods.nodes;
-  const bool framed = rods.framed, strands_rub = rods.strands_rub;
+  const bool framed = rods.framed, strands_rub = !rods.strand_forces.empty();
   const double step = rods.step;
   const Number drag = rods.drag, implicit = rods.implicit;
   const auto* points = rods.points.data(), *velocities = rods.velocities.data();

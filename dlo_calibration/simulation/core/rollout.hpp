@@ -233,7 +233,8 @@ class LaneGroup {
     if (!rods_.is_like(first)) {
       rods_ = Rods<Lanes>();
       rods_.nodes = first.nodes, rods_.step = first.step, rods_.gravity = first.gravity;
-      rods_.framed = first.framed, rods_.twists = first.twists, rods_.strands_rub = first.strands_rub;
+      rods_.framed = first.framed, rods_.twists = first.twists;
+      rods_.strands_rub = first.strands_rub, rods_.locks = first.locks;
       rods_.measured = first.measured;
       rods_.resize();
     }

@@ -38,7 +38,7 @@ Rope::Rope(const Start& start, const Properties& properties, double step, Point 
   rods.nodes = n, rods.step = step, rods.gravity = gravity, rods.level = level;
   rods.friction = properties.friction, rods.drag = properties.drag;
   rods.implicit = step * std::max(properties.internal_damping, 0.6 * step);
-  rods.strands_rub = properties.bending_friction > 0.0;
+  rods.strands_rub = properties.bending_friction > 0.0, rods.locks = properties.locking > 0.0;
   rods.resize();
   rods.points = start.points, rods.velocities = start.velocities, rods.solved = 1.0;
   for (int i = 0; i < segments; ++i) {
@@ -121,11 +121,15 @@ void Rope::hold(const std::vector<int>& nodes) {
         rods.bending[i + b][a - b] += weights[i] * bends[i][a] * bends[i][b];
   for (auto& row : rods.bending)
     for (double& entry : row) entry *= properties_.bending_stiffness;
+  hold_frame(rigid, relative, cells);
   for (std::size_t i = 0; i < rods.strands.size(); ++i) {
     const double slip = properties_.bending_slip, stiffness = properties_.bending_stiffness * weights[i];
     rods.strands[i] = {bends[i], stiffness * (properties_.bending_friction / slip), cells[i] * slip};
   }
-  hold_frame(rigid, relative, cells);
+  for (std::size_t i = 0; i < rods.locking.size(); ++i) {
+    const double radius = cells[i] > 0 ? properties_.locking / cells[i] : 0.0;
+    rods.locking[i] = {properties_.bending_stiffness * weights[i], radius * radius};
+  }
 }
 
 void Rope::hold_frame(const std::vector<bool>& rigid, const std::vector<double>& relative,
@@ -148,7 +152,7 @@ void Rope::hold_frame(const std::vector<bool>& rigid, const std::vector<double>&
   }
   const bool all_rigid = std::find(rigid.begin(), rigid.end(), false) == rigid.end();
   const bool was_framed = rods.framed;
-  rods.framed = (curved || !clamps.empty()) && !all_rigid;
+  rods.framed = (curved || rods.locks || !clamps.empty()) && !all_rigid;
   if (was_framed && frame_begun && !rods.framed && rods.strands_rub && rods.twists) {
     rods.framed = true;  // its arrays still have the sizes
     leave_frame(rods);

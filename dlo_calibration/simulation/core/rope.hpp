@@ -69,14 +69,21 @@ struct PlasticBend {
   Vec3<Number> strain;   // elastic part of the bend in the last step
 };
 
-/// What friction between strands adds to the equation of a node.
+/// Locking at an inner node, see moments.hpp.
+template <class Number>
+struct Locking {
+  Number stiffness;  // EI / l [N m]
+  Number scale;      // how much stiffer a bend of 1 makes the joint
+};
+
+/// What friction between strands and locking add to the equation of a node.
 template <class Number>
 struct StrandForce {
   Bending<Number> matrix;  // [kg]
   Vec3<Number> impulse;    // [N s], against the bend
 };
 
-/// Natural curvature and friction between strands at an inner node, in the material frame.
+/// Natural curvature, locking and friction between strands at an inner node, in the material frame.
 template <class Number>
 struct Moment {
   Number x, y;       // what bends the DLO beside its elasticity [N m]
@@ -91,6 +98,7 @@ struct Rods {
   bool twists = false;   // it resists twist; else the frame turns freely as a whole
   bool strands_rub = false;
   bool measured = false;  // its tensions are found in each step
+  bool locks = false;    // it becomes stiffer where it is bent far
   double step = 0.0;     // [s]
   Point gravity{};       // [m/s^2]
 
@@ -102,6 +110,7 @@ struct Rods {
   std::vector<Natural<Number>> natural;
   std::vector<Number> twisting;  // torque per angle at inner nodes [N m]
   std::vector<Strands<Number>> strands;
+  std::vector<Locking<Number>> locking;
 
   // State.
   std::vector<Vec3<Number>> points, velocities;  // [m], [m/s]
@@ -124,7 +133,9 @@ struct Rods {
   std::vector<Number> inverse_lengths, clamped, prescribed, turning, upper;
   std::vector<StrandForce<Number>> strand_forces;
   std::vector<Moment<Number>> moments;
-  std::vector<Number> tensions;        // [N] of the segments, in the last step
+  std::vector<Number> tensions;            // [N] of the segments, in the last step
+  std::vector<Number> stiffening;          // by locking, relative to the bending stiffness
+  std::vector<Natural<Number>> stiffened;  // `natural`, as locking changes it
   Number solved;                       // 1 where the last step was finite
   std::array<Number, 2> last_moves{};  // in the last step, see `Movement`
   std::array<Number, 2> next_moves;    // in this step, without contact
@@ -144,16 +155,20 @@ struct Rods {
     frame_impulses.resize(framed ? n : 0);
     natural.resize(framed ? inner : 0), twisting.resize(framed ? inner : 0);
     joints.resize(framed ? inner : 0), bishop.resize(framed ? 2 : 0);
+    const bool stiffens = framed && locks, moves = strands_rub || stiffens;
     strands.resize(strands_rub ? inner : 0), plastic.resize(strands_rub ? inner : 0);
-    strand_forces.resize(strands_rub ? n : 0), moments.resize(framed && strands_rub ? inner : 0);
+    strand_forces.resize(moves ? n : 0), moments.resize(framed && moves ? inner : 0);
     tensions.resize(measured ? segments : 0);
+    locking.resize(stiffens ? inner : 0);
+    stiffening.resize(stiffens ? inner : 0), stiffened.resize(stiffens ? inner : 0);
   }
 
   /// Whether it can be stepped together with another DLO.
   template <class Other>
   bool is_like(const Rods<Other>& other) const {
     return nodes == other.nodes && framed == other.framed && twists == other.twists &&
-           strands_rub == other.strands_rub && measured == other.measured && step == other.step;
+           strands_rub == other.strands_rub && locks == other.locks && measured == other.measured &&
+           step == other.step;
   }
 };
 
@@ -169,7 +184,7 @@ template <class A, class B, class Copy>
 void each_property(A& a, B& b, Copy copy) {
   copy(a.rest_lengths, b.rest_lengths), copy(a.stiffness, b.stiffness), copy(a.masses, b.masses);
   copy(a.bending, b.bending), copy(a.natural, b.natural), copy(a.twisting, b.twisting);
-  copy(a.strands, b.strands);
+  copy(a.strands, b.strands), copy(a.locking, b.locking);
 }
 
 /// Physical properties of a DLO, in SI units; doc/physics.md explains them.
@@ -177,7 +192,7 @@ struct Properties {
   double bending_stiffness = 0.0, stretching_stiffness = 0.0, mass = 0.0;
   double drag = 0.0, internal_damping = 0.0, friction = 0.0, radius = 0.0;
   double length_scale = 1.0, natural_curvature = 0.0, marker_mass = 0.0, torsion = 0.0;
-  double bending_friction = 0.0, bending_slip = 0.1, clamp_twist = 0.0;
+  double bending_friction = 0.0, bending_slip = 0.1, locking = 0.0, clamp_twist = 0.0;
   std::vector<double> profile = {1.0};  // bending stiffness of parts of equal length, relative to the first
   std::vector<std::array<double, 2>> rest_curvature;  // [1/m] at evenly spaced places
 };
