@@ -31,8 +31,9 @@ from dlo_calibration.vision.observer import drawn, FilmWriter, ImageView
 from dlo_calibration.vision.pose import scale_from_points
 from dlo_calibration.vision.scale import Scale
 from dlo_calibration.vision.view import BoardFinder, film_lens
+from dlo_calibration.workspace.folder import SESSION
 
-SESSION, TRACKED = 'session.mcap', 'tracked.mp4'
+TRACKED = 'tracked.mp4'
 PROGRESS = 2.0  # s between two lines about progress
 BORDER = 3.0  # px; a DLO whose end is nearer to the picture's border goes on beyond it
 LOST_LISTED = 5  # intervals in which the DLO is lost, of which the problems tell

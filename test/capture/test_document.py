@@ -34,7 +34,10 @@ FULL = {
     'obstacles': [{'photograph': A, 'kind': 'peg', 'first': [50, 60], 'second': [55, 60.5], 'height': 0.04,
                    'turn': 0.0},
                   {'photograph': B, 'kind': 'box', 'first': [100, 20], 'second': [150, 90], 'height': 0.1,
-                   'turn': -0.5}]}
+                   'turn': -0.5}],
+    'films': [{'id': 'ddddddd4', 'name': 'rope.mp4', 'ruler': 0.1, 'left_out': [1],
+               'marks': [{'time': 0.5, 'clicks': [[1, 2], [300.5, 4]]}],
+               'held': [{'place': 0.2, 'height': 0.05}]}]}
 
 
 def changed(path, value):
