@@ -220,4 +220,4 @@ def test_a_recording_that_the_others_do_not_predict_is_named_and_they_fit_better
     assert 'what the model does not know' in result.unusable
     without = calibrate(session.trials[:7], options)
     assert not without.unusable
-    assert without.errors.mean < 0.7 * result.errors.mean
+    assert without.errors.mean < 0.9 * result.errors.mean
