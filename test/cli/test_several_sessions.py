@@ -54,6 +54,7 @@ def test_each_session_gets_a_value_of_its_own(fit, sessions):
         {**TRUTH, 'friction_session_2': 50.0, 'friction_session_3': 60.0}, abs=0.5)
 
 
+@pytest.mark.long
 def test_one_value_for_all_fits_worse(fit, sessions):
     shared, own = (fit(*sessions, *words)[1] for words in ([], ['--own', 'friction']))
     assert 'friction_session_2' not in shared['parameters']
@@ -73,6 +74,7 @@ def test_the_files_of_the_result_give_it_again(fit, sessions, tmp_path):
     assert cli.main(['validate', str(tmp_path / 'out' / 'result.xml'), str(sessions[0])], new_toy) == 0
 
 
+@pytest.mark.long
 def test_an_interrupted_calibration_of_several_sessions_goes_on(fit, sessions, tmp_path):
     class Dying(ToySimulator):
         count = 0

@@ -97,6 +97,7 @@ def test_a_film_in_which_nothing_moves_is_tracked_and_makes_no_trial(resting, tm
     assert not (tmp_path / 'session.mcap').exists()
 
 
+@pytest.mark.long
 def test_images_of_a_recorded_session_are_a_film(resting, tmp_path, capsys):
     _, points, image = resting
     types, records = bag_types(), []
@@ -137,6 +138,7 @@ def test_bad_arguments_get_one_line_with_the_remedy(resting, capsys, arguments, 
     assert ';' in line
 
 
+@pytest.mark.long
 def test_bad_films_get_one_line_with_the_remedy(resting, tmp_path, capsys):
     path, points, image = resting
     dark, empty = tmp_path / 'dark.mp4', tmp_path / 'empty.mp4'

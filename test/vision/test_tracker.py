@@ -72,6 +72,7 @@ def moving(count):
     return [bent(0.3 + 0.5 * k / count, (0.0, 0.4 * STEP * k)) for k in range(count)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('scaled', [True, False])
 def test_points_stay_on_their_material(scaled):
     curves = moving(10)
@@ -87,6 +88,7 @@ def test_points_stay_on_their_material(scaled):
     assert found[-1].width == pytest.approx(wide, rel=0.3)
 
 
+@pytest.mark.long
 def test_time_can_run_backwards():
     curves = moving(10)[::-1]
     assert np.nanmax(errors(tracked(curves)[-1], curves[-1])) < FAR
@@ -132,6 +134,7 @@ def test_a_crossing_keeps_the_order():
         assert np.isfinite(off).mean() > 0.7
 
 
+@pytest.mark.long
 def test_a_dlo_that_leaves_the_picture_and_comes_back():
     ways = np.concatenate([np.arange(0, 18), np.arange(18, -1, -1)]) * 0.012
     curves = [bent(0.3, (0.1 + way, 0.0)) for way in ways]
@@ -145,6 +148,7 @@ def test_a_dlo_that_leaves_the_picture_and_comes_back():
     assert np.nanmax(errors(found[-1], curves[-1])) < FAR
 
 
+@pytest.mark.long
 def test_blur_is_no_obstacle():
     curves = moving(8)
     rendered = renderer()
@@ -173,6 +177,7 @@ def test_a_dlo_that_is_covered_is_lost_with_a_reason_and_found_again():
     assert np.nanmax(errors(found[-1], curves[-1])) < FAR
 
 
+@pytest.mark.long
 def test_a_dlo_that_was_put_elsewhere_meanwhile_is_found_by_itself():
     curves = [bent(0.4, (0.0, -0.1))] * 3 + [None] * 3 + [bent(-0.5, (0.03, 0.12))] * 25
     found = tracked(curves)
@@ -184,6 +189,7 @@ def test_a_dlo_that_was_put_elsewhere_meanwhile_is_found_by_itself():
         assert one.lost or np.nanmax(errors(one, curve)) < 2 * FAR
 
 
+@pytest.mark.long
 def test_a_picture_of_something_else_is_never_called_tracked():
     curves = [bent(0.4)] * 2 + [None] * 12
     found = tracked(curves)
