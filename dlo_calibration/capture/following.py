@@ -33,6 +33,10 @@ from dlo_calibration.vision.view import BoardFinder, film_lens
 FRAME = 'table'  # frame_id of the messages
 ZERO = 1_700_000_000 * NANOSECONDS  # stamp of a film's first image: in 2023, as real stamps are
 FEWEST = 2  # clicks of a mark
+#: What to know of a film whose lens is estimated.
+WITHOUT_LENS = (
+    'the focal length is estimated from the board, and may be off by some percent, which shifts what lies '
+    'far from it: give the calibration of the camera, or lay the board close to the DLO')
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,8 +93,8 @@ def follow(film: Film, entry: FilmEntry, count: int, lens: Lens | None = None, *
     :raises InputError: where there are no marks, or nothing in the image of the first one.
     :raises CancelledError: when stopped.
     """
+    problems = [WITHOUT_LENS] if lens is None else []
     lens = film_lens(film, entry.ruler) if lens is None else lens.resized(film.size)
-    problems: list[str] = []
 
     def counted(done: int) -> None:
         on_image(done)

@@ -16,7 +16,7 @@ import numpy as np
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.capture.document import MarkEntry
 from dlo_calibration.capture.filming import Filming, HeldPoint
-from dlo_calibration.capture.following import filmed_trials, FilmedTrial, FRAME, views_of, ZERO
+from dlo_calibration.capture.following import filmed_trials, FilmedTrial, FRAME, views_of, WITHOUT_LENS, ZERO
 from dlo_calibration.capture.trials import measured_options
 from dlo_calibration.cli.output import print_json, print_message, standard_output
 from dlo_calibration.cli.trace import check_count, pixels_of, places_of
@@ -73,7 +73,7 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     film: Source = read_film(chosen.video) if chosen.image is None else read_image_topic(
         chosen.video, chosen.image)
     scale = _scale(chosen, film)
-    problems: list[str] = []
+    problems = [WITHOUT_LENS] if chosen.board and chosen.camera is None else []
     begin = time.perf_counter()
     progress = _Progress(max(round(film.duration * film.frame_rate), 1))
     clicked = MarkEntry(chosen.at, tuple(map(tuple, clicks.tolist())))

@@ -205,7 +205,7 @@ class CalibratorNode(GraphNode[Options]):
         self.reactions.update(message_lost=self._on_message_lost, matched=self._on_matched)
         self.subscribe(*INPUT_TYPES)
         for name in self.session.requests:
-            self.create_service(Trigger, f'~/{name}', functools.partial(self._serve, name))
+            self.create_service(Trigger, f'~/{name}', functools.partial(self.serve, name))
         self._jump: TimeJump | None = None  # of the node's clock, back
         # Without this reference, rclpy never calls back, or crashes.
         self._jumps = self.get_clock().create_jump_callback(
@@ -320,7 +320,8 @@ class CalibratorNode(GraphNode[Options]):
 
     # Services and the clock
 
-    def _serve(self, name: str, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def serve(self, name: str, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Answer a request; one that follows messages waits for them."""
         self.hear_waiting()
         count, ready = self._waiting, self._in_frame()
         if name == 'stop' or ready and not count:

@@ -29,6 +29,7 @@ from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPo
 from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
+from std_srvs.srv import Trigger
 
 from dlo_calibration.calibration.options import Declaration, DeclaredOptions
 from dlo_calibration.errors import DEFECT, InputError, printable
@@ -279,11 +280,24 @@ class GraphNode(OptionsNode[Chosen]):
 
     def act(self) -> None:
         """Do what is due now; called many times a second."""
-        raise NotImplementedError
+        if self.session is not None:
+            self.session.tick()
 
     def take(self, kind: str, octets: bytes, info: Mapping[str, Any]) -> None:
         """Take a message that came, with what rclpy says of it."""
-        raise NotImplementedError
+        if self.session is not None:
+            self.session.hear(kind, octets)
+
+    def hear_waiting(self) -> None:
+        """Take the messages that wait."""
+        for kind in self.inputs:
+            self.drain(kind)
+
+    def serve(self, name: str, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Answer a request by its name, as the callback of its service."""
+        assert self.session is not None
+        response.success, response.message = self.session.request(name)
+        return response
 
     def hear(self, kind: str, octets: bytes, info: Mapping[str, Any]) -> None:
         """Take a message, as the callback of its subscription."""

@@ -89,6 +89,14 @@ class NodeSession(Generic[Chosen_co]):
         self._status: dict[str, Any] = {}  # content of the last message
         self._status_sent = float('-inf')  # [s]
 
+    def hear(self, kind: str, octets: bytes) -> None:
+        """Take a message that came on an input topic."""
+        raise NotImplementedError
+
+    def tick(self) -> None:
+        """Do what is due now; the node calls this many times a second."""
+        raise NotImplementedError
+
     def refuse(self, text: str) -> None:
         """Report a refusal in the log and in ``~/status``; a repeated reason only now and then."""
         self._state.last_refusal = self._state.counted.add(safe_line(text))

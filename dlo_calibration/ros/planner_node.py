@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import functools
 from pathlib import Path
-from typing import Any, Mapping, Sequence
+from typing import Any, Sequence
 
 from std_srvs.srv import Trigger
 
@@ -68,7 +68,7 @@ class PlannerNode(GraphNode[PlannerOptions]):
         self.session = PlannerSession(self, self.types, make_simulator)
         self.subscribe(CHAIN, GOAL, *([] if self._next else [DESCRIPTION]))
         for name in self.session.requests:
-            self.create_service(Trigger, f'~/{name}', functools.partial(self._serve, name))
+            self.create_service(Trigger, f'~/{name}', functools.partial(self.serve, name))
         self.info('call ~/plan to plan from the newest ~/chain to the newest ~/goal_chain')
 
     def act(self) -> None:
@@ -113,22 +113,6 @@ class PlannerNode(GraphNode[PlannerOptions]):
         else:
             self.info(f'{path} is published on {self.topic(DESCRIPTION)}')
 
-    # Subscriptions and services
-
-    def take(self, kind: str, octets: bytes, _: Mapping[str, Any]) -> None:
-        """Give a message to the session."""
-        if self.session is not None:
-            self.session.hear(kind, octets)
-
-    def hear_waiting(self) -> None:
-        """Give the messages that wait to the session."""
-        for kind in self.inputs:
-            self.drain(kind)
-
-    def _serve(self, name: str, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        assert self.session is not None
-        response.success, response.message = self.session.request(name)
-        return response
 
 
 def _read(name: str) -> tuple[Path, bytes, Description]:

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import functools
-from typing import Any, Mapping, Sequence
+from typing import Any, Sequence
 
 from std_srvs.srv import Trigger
 
@@ -33,33 +33,13 @@ class TrackerNode(GraphNode[TrackerOptions]):
             self.session = TrackerSession(self, self.types)
             self.subscribe(*INPUT_TYPES)
             for name in self.session.requests:
-                self.create_service(Trigger, f'~/{name}', functools.partial(self._serve, name))
+                self.create_service(Trigger, f'~/{name}', functools.partial(self.serve, name))
             self.serve_parameters()
         except BaseException:
             self.close()
             raise
 
-    def act(self) -> None:
-        """Do what is due now."""
-        if self.session is not None:
-            self.session.tick()
-
     def changed(self, names: Sequence[str], options: TrackerOptions) -> None:
         """Find the DLO anew with other parameters, from the next image on."""
         if self.session is not None:
             self.session.begin(options)
-
-    def take(self, kind: str, octets: bytes, _: Mapping[str, Any]) -> None:
-        """Give a message to the session."""
-        if self.session is not None:
-            self.session.hear(kind, octets)
-
-    def hear_waiting(self) -> None:
-        """Give the messages that wait to the session."""
-        for kind in self.inputs:
-            self.drain(kind)
-
-    def _serve(self, name: str, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        assert self.session is not None
-        response.success, response.message = self.session.request(name)
-        return response
