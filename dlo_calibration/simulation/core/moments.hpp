@@ -111,11 +111,11 @@ inline void add_stiffness(Rods<Number>& rods) {
   const Number none{};
   Number next = none, beside_next = none, after = none;  // of the joints so far, see strands.hpp
   for (int i = 0; i < joints; ++i) {
-    auto& [first, second, third] = forces[i].matrix;
-    first = first + next, second = second + beside_next;
+    auto& row = forces[i].matrix;
+    row[0] = row[0] + next, row[1] = row[1] + beside_next;
     next = after, beside_next = after = none;
     const auto add = [&](const Number& weight, const Number& r0, const Number& r1, const Number& r2) {
-      first = first + weight * r0 * r0, second = second + weight * r0 * r1, third = third + weight * r0 * r2;
+      row[0] = row[0] + weight * r0 * r0, row[1] = row[1] + weight * r0 * r1, row[2] = row[2] + weight * r0 * r2;
       next = next + weight * r1 * r1, beside_next = beside_next + weight * r1 * r2;
       after = after + weight * r2 * r2;
     };
