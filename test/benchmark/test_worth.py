@@ -132,6 +132,7 @@ def study(**changed):
     return replace(WorthStudy({ROPE: observed}, 1, 1, PlanOptions(workers=1), 'the command'), **changed)
 
 
+@pytest.mark.long
 def test_an_interrupted_experiment_continues_and_repeats_nothing(tmp_path):
     reports, planner = [], Nudging(1)
 

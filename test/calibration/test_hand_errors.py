@@ -55,6 +55,7 @@ def width(result, name):
     return result.parameters[name].upper - result.parameters[name].lower
 
 
+@pytest.mark.long
 def test_late_and_shifted_hands_come_back_within_their_intervals():
     right, wrong = fit(), fit((*PHYSICS, *HANDS[:3]), late=-0.08, shift=(0.015, 0.0, 0.0))
     physical = {name: wrong.parameters[name] for name in HANDS[:3]}

@@ -79,6 +79,7 @@ def test_an_even_dlo_stays_in_one_part():
     assert result.values == calibrated(observed(EVEN, TRUTH), parts=1).values
 
 
+@pytest.mark.long
 def test_a_rest_shape_is_recovered_where_the_trials_show_it():
     result = calibrated(observed(CURVED, REST_SHAPE), budget=300, names=('flexibility', 'torsion'))
     assert result.space.knots == 3
@@ -95,6 +96,7 @@ def test_a_straight_dlo_stays_straight():
     assert result.space.free == tuple(straight)
 
 
+@pytest.mark.long
 def test_a_cable_that_locks_is_found():
     locks = {**STRANDS, 'locking': 62.0}
     result = calibrated(observed(ParameterSpace(tuple(locks)), locks), budget=800, names=tuple(STRANDS))
@@ -114,6 +116,7 @@ def test_a_cable_that_is_curved_and_locks_is_found():
         assert result.values[name] == pytest.approx(value, abs=1.0), name
 
 
+@pytest.mark.long
 def test_a_rod_whose_errors_have_another_cause_does_not_lock():
     damped = {'flexibility': 45.0, 'torsion': 60.0, 'damping': 65.0}
     result = calibrated(observed(ParameterSpace(tuple(damped)), damped), budget=800, names=tuple(STRANDS))

@@ -68,9 +68,8 @@ def test_a_default_that_the_trials_refute_does_not_stay(default, stays):
     assert result.best.values == result.values
 
 
-@pytest.mark.parametrize('free', [
-    ('flexibility', 'friction'),
-    pytest.param(('flexibility', 'friction', 'damping'), marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize('free', [('flexibility', 'friction'), ('flexibility', 'friction', 'damping')])
 def test_intervals_of_a_search_that_ends_beside_the_minimum_are_around_its_values(free):
     others = {name: value for name, value in TRUTH.items() if name not in free}
     regular, inside = 0, []

@@ -106,6 +106,7 @@ def test_sessions_of_several_photographs_are_fitted_together(tmp_path, capsys):
     assert printed['parameters']['flexibility']['physical_value'] == pytest.approx(BENDING, rel=0.15)
 
 
+@pytest.mark.long
 def test_a_camera_that_is_turned_is_told_by_a_plumb_line(tmp_path):
     camera = view(roll=0.2)
     plumb = words(pixels(camera, np.array([(0.25, 0.2), (0.25, -0.2)])))

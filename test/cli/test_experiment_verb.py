@@ -68,6 +68,7 @@ def timeless(text):
     return printed
 
 
+@pytest.mark.long
 def test_all_files_are_written_and_the_tables_printed(run, session, tmp_path):
     code, output, errors = run(session, '--runs', 2, '--search', 'random', 'least_squares',
                                '--evaluations', 12, '--output', tmp_path / 'out')
@@ -104,6 +105,7 @@ def test_the_json_document_is_the_file_and_has_the_recovered_truth(run, session,
     assert set(finding['actions']) == {'trial 1', 'trial 2', 'trial 3'}
 
 
+@pytest.mark.long
 def test_the_numbers_are_the_same_for_any_number_of_processes(run, session, tmp_path, undrawn):
     serial = run(session, *SMALL, '--json', '--output', tmp_path / 'one')[1]
     parallel = run(session, *SMALL, '--json', '--output', tmp_path / 'two', workers=2)[1]
@@ -217,6 +219,7 @@ def test_a_killed_experiment_goes_on_where_it_was(run, session, tmp_path, undraw
         time.sleep(0.02)
 
 
+@pytest.mark.long
 def test_files_that_cannot_be_written_are_named_and_the_tables_are_printed(run, session, tmp_path, undrawn,
                                                                  monkeypatch):
     monkeypatch.chdir(tmp_path)  # a long path would shorten the sentence

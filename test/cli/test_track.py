@@ -88,6 +88,7 @@ def test_a_film_becomes_a_session_with_the_trials_of_the_hand(moves, tmp_path):
     assert int(drawing.get(cv2.CAP_PROP_FRAME_COUNT)) == len(film.times)
 
 
+@pytest.mark.long
 def test_a_film_in_which_nothing_moves_is_tracked_and_makes_no_trial(resting, tmp_path, capsys):
     path, points, _ = resting
     report = tracked(capsys, path, '--points', points, '--board', '--output', tmp_path, '--at', 0.2)

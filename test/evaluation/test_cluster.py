@@ -166,6 +166,7 @@ def test_a_machine_without_a_module_or_with_another_version_is_refused(scheduler
         worker.wait()
 
 
+@pytest.mark.long
 def test_an_evaluation_that_kills_too_many_workers_ends_with_what_to_do(tmp_path):
     with running(tmp_path, 1, DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES='0') as (address, _):
         with pytest.raises(DloCalibrationError, match='1 workers of the scheduler .* give them more memory'):
@@ -200,6 +201,7 @@ def test_a_calibration_goes_on_when_a_worker_returns(scheduler, start_worker, mo
     same(torn, calibrate(toy_trials(2), options(), make_simulator=new_toy))
 
 
+@pytest.mark.long
 def test_a_hanging_scheduler_does_not_delay_the_end_and_a_killed_one_ends_the_calibration(tmp_path, capfd):
     def search(address, **rest):
         return calibrate(toy_trials(1), options(address, evaluations=10000),
@@ -239,6 +241,7 @@ def test_without_the_library_it_says_how_to_install_it(monkeypatch):
         calibrate(toy_trials(1), options('tcp://127.0.0.1:1'), make_simulator=new_toy)
 
 
+@pytest.mark.long
 def test_a_call_whose_result_dask_misreads_as_an_error_is_sent_again():
     """A worker may be lost after its result has arrived, and before Dask has read its status."""
     from distributed.cfexecutor import _cascade_future

@@ -291,6 +291,7 @@ for turn in range(int(sys.argv[3])):
 TURNS = 10
 
 
+@pytest.mark.long
 def test_killed_at_any_moment_a_session_reads_up_to_its_last_complete_message(tmp_path):
     source = write_session(tmp_path / 'source', GOOD)
     whole = read_session(source).records

@@ -249,6 +249,7 @@ def test_mutated_fields_are_collected_or_refused(data):
         score_of(collector.trials)
 
 
+@pytest.mark.long
 @drawing(5, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(messages=st.lists(mutations('camera'), min_size=1, max_size=12))
 def test_mutated_bytes_on_topics_leave_the_good_trials(topics, messages):
@@ -258,6 +259,7 @@ def test_mutated_bytes_on_topics_leave_the_good_trials(topics, messages):
     assert topics.robot.status['trials'] == '2'
 
 
+@pytest.mark.long
 @drawing(8, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(messages=st.lists(mutations('world'), min_size=1, max_size=6), good_last=st.booleans())
 def test_mutated_bytes_in_a_file_end_in_a_result_or_one_line(tmp_path_factory, command, messages, good_last):

@@ -121,6 +121,7 @@ def test_any_number_of_threads_finds_the_same_plan():
     assert_same(single, triple)
 
 
+@pytest.mark.long
 def test_sequences_simulated_together_give_the_plan_of_sequences_simulated_one_by_one():
     def planned_with(simulator, workers):
         return plan(DLO, straight(9), goal, replace(ONE, actions=2, kinds=('drag',), workers=workers),

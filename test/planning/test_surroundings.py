@@ -109,6 +109,7 @@ def test_posts_between_two_chains_are_passed_at_another_side():
     assert passed_wrongly(turns, turns[[0, -1]], np.zeros((1, 2))) == 2
 
 
+@pytest.mark.long
 def test_a_dlo_is_led_around_a_post_as_the_goal_lies(scene_of, monkeypatch):
     """
     The post stands between start and goal: of drags, only one that leads an end around it reaches the goal.

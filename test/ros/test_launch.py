@@ -175,6 +175,7 @@ def test_launch_refuses_an_argument_that_it_does_not_know_and_lists_the_others(n
     launched(node, monkeypatch)
 
 
+@pytest.mark.long
 def test_ros2_launch_knows_the_launch_file(node, install):
     if shutil.which('ros2') is None:
         pytest.skip('the command ros2 is not installed')

@@ -86,6 +86,7 @@ def test_start_without_a_complete_trial_is_refused_and_says_what_is_missing(star
     assert whole(graph.calibrated())['trials'] == '1'
 
 
+@pytest.mark.long
 def test_messages_after_the_start_belong_to_the_next_calibration(start, tmp_path, command):
     graph = start(ToySimulator(0.002))
     graph.send(session_messages(TYPES, 1))
@@ -537,6 +538,7 @@ def test_a_clock_that_went_back_begins_another_session_and_trials_never_mix(star
     assert (len(read_session(first).trials), len(read_session(second).trials)) == (2, 1)
 
 
+@pytest.mark.long
 def test_a_calibration_goes_on_when_the_clock_goes_back_and_its_result_lies_with_its_trials(
         start, tmp_path, command):
     graph = start(ToySimulator(0.002))

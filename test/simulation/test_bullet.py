@@ -127,6 +127,7 @@ def test_a_rope_falls_onto_the_box_of_a_scene_and_onto_the_table(scene, among):
     assert chain[[0, -1], 2] == pytest.approx(0.005, abs=1e-3)  # 0.22 m overhang at both ends of the box
 
 
+@pytest.mark.long
 def test_friction_is_that_of_the_scene(scene, among):
     """Pull a rope over a smooth and a rough box; the softer it is, the longer friction makes it."""
     points = line((0.0, 0, 0.205), (1, 0, 0), 0.6, 31)
@@ -147,6 +148,7 @@ def test_friction_is_that_of_the_scene(scene, among):
         assert stretch == pytest.approx(expected, rel=0.05)
 
 
+@pytest.mark.long
 def test_a_repeat_in_a_scene_is_bit_exact_whatever_was_simulated_between(scene):
     path = scene(BOX.format(friction=0.7))
     simulator = BulletSimulator(scene=path, settle_limit=0.1)

@@ -73,6 +73,7 @@ def test_a_tag_gives_the_pose_of_a_hand():
         assert angle(poses.rotations[best], turn) < 3.0
 
 
+@pytest.mark.long
 def test_the_path_of_a_tag_is_smooth_goes_on_over_short_gaps_and_leaves_out_long_ones():
     times = np.arange(0.0, 1.5, 1 / 30)
     finder, poses = TagFinder(), {}

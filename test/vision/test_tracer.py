@@ -91,6 +91,7 @@ def test_a_part_can_be_traced():
     assert np.linalg.norm(trace.pixels[[0, -1]] - inner[[0, -1]], axis=1).max() < 8
 
 
+@pytest.mark.long
 def test_under_a_hand_the_line_is_not_sure():
     example = scene(8, SIZE, off=OFF, **{**PLAIN, 'radius': 0.003})
     middle = example.curve[330, :2]
@@ -105,6 +106,7 @@ def test_under_a_hand_the_line_is_not_sure():
     assert not trace.sure[nearest]
 
 
+@pytest.mark.long
 def test_the_same_clicks_give_the_same_line_also_after_others():
     example = scene(8, SIZE, off=OFF, **PLAIN)
     tracer = Tracer(picture(example))

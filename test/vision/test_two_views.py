@@ -34,8 +34,10 @@ def distance(points, truth):
     return np.linalg.norm(points[:, None] - truth[None], axis=2).min(axis=1)
 
 
-@pytest.mark.parametrize('truth', [lifted(), lifted(0.5), lifted(0.3, bend=1.3), curve()],
-                         ids=['an end', 'the middle', 'strongly bent', 'it lies'])
+@pytest.mark.parametrize('truth', [
+    pytest.param(lifted(), id='an end', marks=pytest.mark.long), pytest.param(lifted(0.5), id='the middle'),
+    pytest.param(lifted(0.3, bend=1.3), id='strongly bent'),
+    pytest.param(curve(), id='it lies', marks=pytest.mark.long)])
 @pytest.mark.parametrize('side', SIDES.values(), ids=SIDES)
 def test_the_curve_in_space_is_found(truth, side):
     axis = axis_of_two_views(traced(truth, ABOVE), ABOVE, traced(truth, side), side, DIAMETER)
@@ -58,7 +60,8 @@ def test_the_second_line_may_be_clicked_the_other_way_round():
     (lifted()[:-60], SIDES['from the side'], 'last end'),
     (lifted() + (0.04, 0, 0), SIDES['from the side'], 'first end'),
     (lifted() - SAG, SIDES['from the side'], 'below the table'),
-    (lifted() + SAG[:, [2, 0, 1]], SIDES['from the other side'], 'second photograph'),
+    pytest.param(lifted() + SAG[:, [2, 0, 1]], SIDES['from the other side'], 'second photograph',
+                 marks=pytest.mark.long),
 ], ids=['the same view', 'a part', 'it moved', 'another height', 'another shape'])
 def test_views_that_do_not_determine_the_curve_are_refused(second, scale, text):
     with pytest.raises(InputError, match=text):
