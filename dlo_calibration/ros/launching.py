@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 import sys
+from types import MappingProxyType
 from typing import Any, Iterable, Mapping, Sequence
 
 from dlo_calibration.errors import InputError, suggestion
@@ -70,11 +71,12 @@ def node_and_rviz(file: str, node: str, *, parameters: Mapping[str, str], topics
 SEEN = {'initial_chain': 'initial_chain', 'action': 'action', 'goal_chain': 'chain'}
 
 
-def tracker_and_calibrator(file: str) -> Any:
+def tracker_and_calibrator(file: str, parameters: Mapping[str, str] = MappingProxyType({})) -> Any:
     """
     Return a LaunchDescription of the tracker, of a calibrator that hears it, and of RViz if wanted.
 
     :param file: the launch file.
+    :param parameters: more of the calibrator's that are launch arguments, with their descriptions.
     :raises InputError: for an unknown argument, or where RViz is wanted and not installed.
     """
     from ament_index_python.packages import get_package_share_directory
@@ -94,6 +96,7 @@ def tracker_and_calibrator(file: str) -> Any:
         'camera_info': ('', "topic of the camera's calibration; empty: the tracker's own"),
         'depth': ('', "topic of the aligned depth; empty: the tracker's own"),
         'mass': ('', 'mass of the whole DLO [kg]; empty: unknown'),
+        **{name: ('', f'{words}; empty: as the parameter file says') for name, words in parameters.items()},
         'frame': ('table', 'frame_id of the chains'),
     }
     check_arguments(file, (*arguments, 'rviz'))
@@ -109,7 +112,8 @@ def tracker_and_calibrator(file: str) -> Any:
                                 *flags({'points': value['points'], 'frame_id': value['frame']}, topics)]),
             Node(package='dlo_calibration', executable='calibrator', name='calibrator', output='screen',
                  ros_arguments=['--params-file', str(config / 'calibrator.yaml'), *flags(
-                     {'mass': value['mass']}, {name: f'/tracker/{of}' for name, of in SEEN.items()})]),
+                     {name: value[name] for name in ('mass', *parameters)},
+                     {name: f'/tracker/{of}' for name, of in SEEN.items()})]),
             Node(package='rviz2', executable='rviz2', name='rviz2',
                  arguments=['-d', str(config / 'tracker.rviz'), '-f', LaunchConfiguration('frame')],
                  condition=IfCondition(LaunchConfiguration('rviz'))),

@@ -351,6 +351,7 @@ class CalibrationSession(NodeSession[CalibratorOptions]):
 
     def change_options(self) -> None:
         """Use the options in force from now on; `collect_anew` collects the messages so far with them."""
+        self._state.asked = None  # other limits permit other actions
         self.collecting.change(self._graph.options().of_calibration)
 
     def collect_anew(self) -> None:
@@ -617,6 +618,7 @@ class CalibrationSession(NodeSession[CalibratorOptions]):
         if collector.count:
             state.minutes_left = advice.trials * (self._clock() - state.first) / collector.count / 60
         pose, stamp = collector.pose, self._graph.stamp() or NANOSECONDS
+        self._report()  # whoever gets the action finds its words there
         if advice.action is None:
             message = self._types.build(OUTPUT_TYPES['advice'], points=[], joint_names=[],
                                         header=self._types.header(stamp, collector.frame_id))

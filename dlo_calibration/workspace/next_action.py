@@ -198,6 +198,8 @@ class _Seeker:
                 return replace(nothing, words=self._why(then))
             expectation = replace(expectation, wanted=wanted)
             left, _ = expectation.foreseen()
+        if (nothing.std <= nothing.wanted).all():
+            left = 1  # only to see whether it agrees
         ranked = [coarse[k] for k in expectation.ranked]
         refined, finer = self._refined(ranked[:BEST], wanted)
         places = {id(inquiry): k for k, inquiry in enumerate(refined)}

@@ -67,6 +67,19 @@ def test_a_chain_that_has_not_moved_asks_for_no_other_advice(start):
     assert len(graph.heard['advice']) == 1
 
 
+def test_other_limits_give_other_advice(start):
+    """As where a robot cannot do what was advised."""
+    graph = start()
+    graph.send(session_messages(TYPES, 1)[:1])
+    first = advised(graph, 1)
+    assert len(first.joint_names) == 1
+    graph.set.update(kinds=['drag'], height=0.2)
+    graph.session.change_options()
+    second = advised(graph, 2)
+    heights = [point.transforms[0].translation.z for point in second.points]
+    assert max(heights) - min(heights) < 0.01
+
+
 def test_it_calibrates_when_what_is_wanted_is_reached(start):
     graph = start(wanted='flexibility 20')
     graph.send(session_messages(TYPES, 2))

@@ -121,6 +121,17 @@ def test_the_launch_file_of_the_tracker_starts_a_calibrator_that_hears_it(monkey
         re.findall(r'Value: (/tracker/.*)', shown))
 
 
+def test_the_launch_file_of_a_self_calibration_passes_on_what_is_wanted_and_the_limits(monkeypatch):
+    given = {'wanted': 'flexibility 2, friction 3', 'reach_1': 'annulus 0 0 0.2 0.8', 'height': '0.1'}
+    started = {entity.options['name']: entity.options['ros_arguments'] for entity in launched(
+        'self_calibration', monkeypatch, image='/camera/image_raw', **given)
+        if entity.kind == 'Node' and entity.options['name'] != 'rviz2'}
+    assert set(started) == {'tracker', 'calibrator'}
+    assert {f'{name}:={value}' for name, value in given.items()} <= set(started['calibrator'])
+    assert '~/goal_chain:=/tracker/chain' in started['calibrator']
+    assert not any(word.startswith('hands:=') for word in started['calibrator'])
+
+
 def test_launch_starts_rviz_only_where_it_is_asked_for(node, described):
     arguments = declared(described)
     rviz, = (entity for entity in described if entity.kind == 'Node' and entity.options['package'] == 'rviz2')
