@@ -8,8 +8,8 @@ A robot that asks its own questions: it does what the calibrator advises, until 
     python3 examples/self_calibration.py
 
 Robot, camera and rope are played here (`played_rope.py`): the rope more finely than in the calibrator, seen
-with a noise of 1.5 mm and hidden points, and gripped up to 5 mm beside where the hands think.  With --trouble,
-the hands stop half way in every second action; what they did is what counts.  Replace `PlayedRope` by yours.
+with a noise of 1.5 mm and hidden points, and gripped up to 5 mm beside where the hands think.  Replace
+`PlayedRope` by yours.  With --trouble, the hands stop half way in every second action: what they did counts.
 """
 
 import argparse
