@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from dataclasses import dataclass, field
+from pathlib import Path
 import time
 from typing import Any, Callable, Iterator, Mapping
 
@@ -19,12 +20,13 @@ import numpy as np
 
 from dlo_calibration.calibration.choice import choose
 from dlo_calibration.calibration.engines import SimulatorFactory
-from dlo_calibration.calibration.options import DeclaredOptions, Options
+from dlo_calibration.calibration.options import declared, DeclaredOptions, MACHINE, Options
 from dlo_calibration.calibration.passport import Passport
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.errors import InputError, safe_line, SimulationError
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.files.result import description_document
+from dlo_calibration.files.session import read_session
 from dlo_calibration.inference.trial_information import TrialInformation
 from dlo_calibration.messages.codec import (
     action_trajectory,
@@ -55,6 +57,10 @@ from dlo_calibration.workspace.worker import CalibrationWarning, Failure, Progre
 @dataclass(frozen=True)
 class CalibratorOptions(Options, AdviceOptions):
     """Everything that a user of the node can set: options of the calibration, and of the advice."""
+
+    resume: str = declared(
+        '', 'folder of a session that was interrupted, even by a crash: its messages come first, as if they '
+        'were sent again; relative to the working directory; empty: begin without trials', of=MACHINE)
 
     @property
     def of_calibration(self) -> Options:
@@ -284,7 +290,21 @@ class CalibrationSession(NodeSession[CalibratorOptions]):
         self._began = self._clock()
         self.behind = False  # whether messages wait; information and markers would delay them
         self._begin_recording()
+        if folder := graph.options().resume:
+            self._resume(Path(folder).expanduser())
         self._report()
+
+    def _resume(self, folder: Path) -> None:
+        """
+        Hear the messages of an earlier session.
+
+        :raises InputError: if it cannot be read.
+        """
+        session = read_session(folder)
+        for record in session.inputs:
+            self.hear(record.name, record.data, flush=False)
+        self.flush()
+        self._graph.info(f'{self._collector.count} trial(s) of {folder} are taken over')
 
     @property
     def _collector(self) -> TrialCollector:

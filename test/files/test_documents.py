@@ -17,10 +17,11 @@ from dlo_calibration.cli import main
 from dlo_calibration.cli.arguments import PREFIX
 from dlo_calibration.files.result import read_result
 from dlo_calibration.messages.codec import OUTPUT_TYPES
-from dlo_calibration.planning.options import AdviceOptions, HandOptions
+from dlo_calibration.planning.options import HandOptions
 from dlo_calibration.planning.plan import plain_plan
 from dlo_calibration.ros import planner_session, tracker_session
 from dlo_calibration.ros.planner_session import PlannerOptions
+from dlo_calibration.ros.session import CalibratorOptions
 from dlo_calibration.ros.tracker_session import TrackerOptions
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -39,8 +40,8 @@ def sections():
 
 
 #: The limits of the hands are documented once, with the planner.
-OF_ADVICE = tuple(declaration for declaration in AdviceOptions.declarations()
-                  if declaration not in HandOptions.declarations())
+OF_ADVICE = tuple(declaration for declaration in CalibratorOptions.declarations()
+                  if declaration not in (*Options.declarations(), *HandOptions.declarations()))
 
 
 @pytest.mark.parametrize('heading, declared', [

@@ -9,6 +9,8 @@ from toy_graph import ToyGraph, TYPES
 from toy_messages import session_messages
 from toy_simulator import ToySimulator
 
+from dlo_calibration.errors import InputError
+from dlo_calibration.files.session import read_session
 from dlo_calibration.messages.codec import chain_cloud, INITIAL
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.ros.session import CalibratorOptions, QUIET
@@ -89,6 +91,29 @@ def test_it_calibrates_when_what_is_wanted_is_reached(start):
     last = graph.heard['advice'][-1]
     assert not last.points and not last.joint_names
     assert graph.status['advice'] == 'each wanted parameter is certain enough'
+
+
+def test_after_a_crash_it_goes_on_with_the_trials_so_far(start, tmp_path):
+    messages = session_messages(TYPES, 2)
+    crashed = start(wanted='flexibility 20')
+    crashed.send(messages[:4])  # the second trial had only begun
+    before = crashed.session._collector.trials
+    folder = crashed.session._recorder.folder
+    again = start(wanted='flexibility 20', resume=str(folder), output_directory=str(tmp_path / 'again'))
+    trial, = again.session._collector.trials
+    assert (trial.goals[0].chain.points == before[0].goals[0].chain.points).all()
+    again.send(messages[4:])
+    again.elapsed += 2 * QUIET
+    again.until(lambda: again.heard['result'])
+    # The new recording has all of them: it gives the same trials.
+    recorded = read_session(again.session._recorder.folder).trials
+    for own, other in zip(recorded, again.session._collector.trials, strict=True):
+        assert (own.goals[-1].chain.points == other.goals[-1].chain.points).all()
+
+
+def test_a_session_that_cannot_be_read_is_refused(start, tmp_path):
+    with pytest.raises(InputError, match='no_such'):
+        start(resume=str(tmp_path / 'no_such'))
 
 
 def test_nothing_wanted_starts_nothing(start):
