@@ -96,8 +96,12 @@ class Trial:
         object.__setattr__(self, 'actions', actions)
         object.__setattr__(self, 'goals', goals)
         if not self.initial.seen.all():
-            places, held = _shown_places(self.initial, goals), self._held_places()
-            object.__setattr__(self, 'initial', self.initial.interpolated(places, held))
+            # From what was seen alone, so that a copy of this trial has the same points, digit for digit.
+            initial = replace(self.initial, points=self.initial.observed)
+            places, held = _shown_places(initial, goals), self._held_places()
+            initial = initial.interpolated(places, held)
+            if not np.array_equal(initial.points, self.initial.points):
+                object.__setattr__(self, 'initial', initial)
         if self.velocity is not None:
             velocity = frozen_array(self.velocity)
             if velocity.shape != (n, 3) or not np.isfinite(velocity).all():

@@ -146,6 +146,17 @@ def test_the_goals_place_a_point_unseen_in_the_initial_chain():
     assert replace(observed, name='u').initial is observed.initial
 
 
+def test_a_copy_of_a_trial_with_unseen_points_has_the_same_points_to_the_digit():
+    angle = np.linspace(0, np.pi, 8)
+    arc = np.random.default_rng(0).normal(0, 2e-3, (8, 3)) + 0.1 * np.stack(
+        [np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    hidden = Chain(np.where(np.isin(np.arange(8), (2, 5))[:, None], np.nan, arc))
+    first = Trial('t', hidden, (Action((hand('left', 0.0, 1.0),)),), [Goal(hidden, 2.0)])
+    for name in ('u', 'v', 'w'):
+        copy = replace(first, name=name)
+        assert (copy.initial.points == first.initial.points).all()
+
+
 @pytest.mark.parametrize('turned', [False, True])
 def test_the_goals_place_a_gripped_end_unseen_in_the_initial_chain(turned):
     angle = np.linspace(0, np.pi, 8)
