@@ -56,6 +56,7 @@ def test_advice_comes_for_the_first_chain_and_after_a_trial(start):
     assert float(graph.status['half_width_flexibility']) < 5
 
 
+@pytest.mark.long
 def test_a_chain_that_has_not_moved_asks_for_no_other_advice(start):
     graph = start()
     chain = chain_cloud(TYPES, Chain(np.column_stack([np.linspace(0, 1, 11), np.zeros(11), np.zeros(11)])),
@@ -69,6 +70,7 @@ def test_a_chain_that_has_not_moved_asks_for_no_other_advice(start):
     assert len(graph.heard['advice']) == 1
 
 
+@pytest.mark.long
 def test_other_limits_give_other_advice(start):
     """As where a robot cannot do what was advised."""
     graph = start()

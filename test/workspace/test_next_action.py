@@ -4,13 +4,15 @@
 """The next action: it tells much, keeps to the limits, is the same each time, and ends with a reason."""
 
 from dataclasses import replace
+import functools
 
 import numpy as np
 import pytest
-from toy_simulator import ToySimulator
+from toy_simulator import toy_trial, ToySimulator
 
 from dlo_calibration import Chain, InputError, Options, Trial
 from dlo_calibration.calibration.engines import make_simulator
+from dlo_calibration.evaluation.pool import Pool
 from dlo_calibration.inference.expectation import Expectation
 from dlo_calibration.inference.target import read_targets, wanted_deviations
 from dlo_calibration.inference.trial_information import Appraisal
@@ -26,14 +28,18 @@ START = Chain(np.column_stack([ALONG, 0.03 * np.sin(8 * ALONG), np.full(15, 0.00
               + np.random.default_rng(0).normal(0, 5e-4, (15, 3)))
 OPTIONS = Options(workers=1, nodes=15, time_step=0.006)
 BOTH = 'flexibility 5, friction 8'
+QUICK = {'kinds': ['drag'], 'speed': 0.5, 'pause': 0.0}  # few candidates, and short rollouts
 
 
 def asked(**limits):
-    return advise((), OPTIONS, AdviceOptions(wanted=BOTH, **limits), start=START)
+    return advise((), OPTIONS, AdviceOptions(**{**QUICK, 'wanted': BOTH, **limits}), start=START)
+
+
+FIRST = functools.cache(asked)
 
 
 def test_the_first_action_is_expected_to_tell_what_is_wanted_and_is_the_same_each_time():
-    first, again = asked(), asked()
+    first, again = FIRST(), asked()
     assert first.words == again.words
     assert all((hand.positions == other.positions).all() for hand, other in zip(
         first.action.hands, again.action.hands, strict=True))
@@ -43,11 +49,11 @@ def test_the_first_action_is_expected_to_tell_what_is_wanted_and_is_the_same_eac
 
 
 def test_an_action_keeps_to_the_reach_of_its_hand_the_kinds_and_the_height():
-    action = asked(reach_1='box 0.25 -0.1 -1 0.7 0.1 1', height=0.03, pause=0.0).action
+    action = asked(kinds=['grasp_and_place'], reach_1='box 0.25 -0.1 -1 0.7 0.1 1', height=0.03).action
     hand, = action.hands
     assert hand.positions[:, 0].min() >= 0.25 and np.abs(hand.positions[:, 1]).max() <= 0.1
     assert hand.positions[:, 2].max() <= START.points[:, 2].max() + 0.0301
-    dragged, = asked(kinds=['drag'], pause=0.0).action.hands
+    dragged, = FIRST().action.hands
     assert np.ptp(dragged.positions[:, 2]) < 0.005
 
 
@@ -75,8 +81,8 @@ def known(std, trials=()):
 
 def test_it_ends_when_each_wanted_parameter_is_certain_enough():
     certain = [0.01, 0.28, 0.02, 0.28]
-    limits = AdviceOptions(wanted=BOTH)
-    trial = Trial('trial 1', START, (asked().action,), (Goal(START, 60.0),))
+    limits = AdviceOptions(**QUICK, wanted=BOTH)
+    trial = Trial('trial 1', START, (FIRST().action,), (Goal(START, 60.0),))
     after_one = next_action(known(certain, (trial,)), OPTIONS, limits, START, make_simulator)
     assert not after_one.reached and after_one.action is not None  # one trial shows no error of its own
     told = next_action(known(certain, (trial, trial)), OPTIONS, limits, START, make_simulator)
@@ -85,8 +91,8 @@ def test_it_ends_when_each_wanted_parameter_is_certain_enough():
 
 def test_it_says_after_two_trials_what_the_hands_cannot_show():
     """A DLO that may not be laid over itself does not show how thick it is."""
-    limits = AdviceOptions(wanted=f'{BOTH}, self_collision 5')
-    trial = Trial('trial 1', START, (asked().action,), (Goal(START, 60.0),))
+    limits = AdviceOptions(**QUICK, wanted=f'{BOTH}, self_collision 5')
+    trial = Trial('trial 1', START, (FIRST().action,), (Goal(START, 60.0),))
     told = next_action(known([0.01, 0.28, 0.02, 0.28], (trial, replace(trial, name='trial 2'))), OPTIONS,
                        limits, START, make_simulator)
     assert told.action is None and not told.reached
@@ -132,10 +138,8 @@ def test_a_dlo_that_a_hand_holds_is_not_at_rest():
 def test_a_shared_error_costs_information():
     """With the toy, whose points move linearly, the standard deviations follow from the formula."""
     space = ParameterSpace(('flexibility', 'friction'))
-    from toy_simulator import toy_trial
     trial = toy_trial({'flexibility': 40.0, 'friction': 60.0})
     shifted = replace(trial, initial=Chain(trial.initial.points + [0.01, 0.0, 0.0]))
-    from dlo_calibration.evaluation.pool import Pool
     unknown = Appraisal.before(space.free, space.default_point()).uncertainty
     points = np.array([[0.3, 0.4], [0.6, 0.5]])
     alone, shared = (Expectation.of([trial], space, Pool(ToySimulator()), points, unknown, 1e-3, 1.0,
