@@ -29,6 +29,7 @@ from dlo_calibration.observation.plausibility import reversed_trials
 FOLLOWS, SIGMAS = 0.02, 6.0  # m, and times the noise: a gripped point further from its place is not held
 WAY = 0.05  # m; the shortest way of a hand that shows whether the DLO follows
 REACH, PLACES = 0.06, 41  # m, to both sides of the nearest place; places there that a hand may really grip
+BESIDE = 0.015  # m; a place so far along the DLO from where a hand grips moves with it
 MOST_VIEWS = 80  # goals of one grip that are compared, evenly spread
 LATEST, STEP = 0.4, 0.02  # s; the largest delay that is looked for, and the steps to it
 EXACT = 0.001  # s, standard deviation; waypoints and views are not stamped more exactly
@@ -240,6 +241,12 @@ class _Grip:
         """Whether the views show if the DLO follows the hand."""
         return self.way > WAY and len(self.times) > LOST
 
+    @property
+    def visible(self) -> bool:
+        """Whether what it grips is seen: the DLO beside it turns about the hand, which looks late or off."""
+        near = self.beside <= BESIDE
+        return bool((np.isfinite(self.places[:, near, 0]).mean(axis=0) >= 0.5).any())
+
     def apart(self, late: Floats) -> Floats:
         """
         Return how far each place is from where it was in the hand at first, (k, g, p) [m]; NaN: unknown.
@@ -305,7 +312,7 @@ class _Grip:
 
 def _delay(grips: Sequence[_Grip]) -> Estimate | None:
     """Return by how much the stamps of hands are late [s]; None: it is not seen."""
-    shown = [grip for grip in grips if grip.shown]
+    shown = [grip for grip in grips if grip.shown and grip.visible]
     if not shown:
         return None
 
@@ -342,7 +349,7 @@ def _shift(grips: Sequence[_Grip], delay: float) -> Estimate | None:
     for grip in pins:
         offsets.append(grip.places[0] - grip.hand.positions[0])  # (p, 3)
         cost = np.zeros(len(offsets[-1]))
-        if grip.shown:
+        if grip.shown and grip.visible:
             squares, views = grip.squares(np.array([delay]))
             cost = np.where(views[0] > 0, squares[0], 0.0) * views[0] / LOST / SCATTER**2
         costs.append(np.where(np.isfinite(offsets[-1][:, 0]), cost, np.inf))
