@@ -33,9 +33,10 @@ WAY = 0.012  # m; the shortest way of a hand that moves a DLO
 PLACES = 201  # along the DLO at which a hand may hold it
 MOST, ROUNDS = 60, 4  # pictures in which they are compared, and weightings of these
 DOUBTED = 0.006  # m; a picture in which a place is farther from where it is in the hand hardly counts
-LEAVING = 0.4  # s; a hand that leaves a DLO stood still so long before they are apart, at most
+LEAVING = 0.6  # s; a hand that leaves a DLO stood still so long before they are apart, at most
 PARTED = 5  # pictures in a row that show hand and DLO apart
-LEFT, SIGMAS = 0.004, 4.0  # m, and times what is typical: a grip farther from its hand is left
+SLIPPED = 0.0015  # m, by which a held point moves when a hand that stands still opens
+LEFT, SIGMAS = 0.005, 5.0  # m, and times what is typical: a grip farther from its hand is left
 HELD = 0.012  # m; from a hand to the point that it holds, at most, over most of the movement
 BESIDE = 0.005  # of a grip's distance from its tag that counts as error: of places alike, the nearest is held
 TRUSTED = 0.9  # of the pictures of a movement; in the others, the tracker may be wrong
@@ -305,14 +306,16 @@ def _hold(seen: Sightings, hand: HandSightings, initial: Chain, motion: Floats, 
                      bool(high > LIFTED))
     known = np.isfinite(hand.positions[:, 0])
     speed = _speed(times, hand.positions)
-    near = _between(times, times[first] - 3 * SPAN, times[first] + 1.5 * SPAN)
+    near = _between(times, times[first] - 3 * SPAN, times[first] + 5 * SPAN)
     near = near[known[near]]
     span = np.arange(first, last + 1)
     span = span[known[span]]
     if not len(near) or len(span) < 3:
         return None
+    # It has come to a standstill before it moves again, with the DLO.
     still = near[speed[near] < STILL]
-    closes = int(still[-1]) if len(still) else int(near[speed[near].argmin()])
+    stands = np.split(still, np.flatnonzero(np.diff(still) > 1) + 1)[0]
+    closes = int(stands[-1]) if len(still) else int(near[speed[near].argmin()])
     if np.linalg.norm(hand.positions[span] - hand.positions[closes], axis=1).max() < WAY:
         return None
     there = near[near <= closes]
@@ -322,13 +325,14 @@ def _hold(seen: Sightings, hand: HandSightings, initial: Chain, motion: Floats, 
         hand.orientations, _about_vertical(hand.orientations, closes)]
     grip = min((_grip(seen, hand, rotations, initial, there, compared) for rotations in turned),
                key=lambda grip: grip.cost)
-    if not grip.typical < HELD:
+    if not grip.mean < HELD:
         return None
     own = _own(seen, grip.place)
     apart = np.full(len(times), np.nan)
     both = np.isfinite(own[:, 0]) & known
     apart[both] = _apart(seen, grip.path[both], own[both], both)
     opens = _opens(times, apart, min(max(LEFT, SIGMAS * grip.typical), HELD), speed, closes, last)
+    opens = _slips(own, speed, closes, opens)
     held = slice(closes, opens + 1)
     moving = grip.path[held][(speed[held] >= STILL) & known[held]]
     lifts = seen.cameras is None or not len(moving) or bool(
@@ -342,12 +346,14 @@ class _Grip:
     """
     How a hand may hold the DLO.
 
-    :param typical: distance between the place and where it is in the hand [m]; `cost` counts the offset, too.
+    :param typical: distance between the place and where it is in the hand [m], the median; `mean`: the root
+        mean square of the trusted ones; `cost` counts the offset, too.
     :param path: (n, 3) where the grip is, as the tag shows it [m], and `turns`, (n, 4); NaN where unknown.
     """
 
     place: float
     typical: float
+    mean: float
     cost: float
     path: Floats
     turns: Floats
@@ -375,7 +381,7 @@ def _grip(seen: Sightings, hand: HandSightings, turns: Floats, initial: Chain, t
     Return the place of the DLO, and its offset from the tag, that move together best.
 
     :param turns: (n, 4) quaternions of the hand.
-    :param there: pictures in which the hand has come to the resting DLO; `compared` are those of the movement.
+    :param there: pictures in which the hand is at the resting DLO; `compared`: those of the movement.
     """
     places = np.linspace(0.0, 1.0, PLACES)
     chains = {int(k): chain for k in compared if (chain := _complete(seen.points[k])) is not None}
@@ -401,15 +407,16 @@ def _grip(seen: Sightings, hand: HandSightings, turns: Floats, initial: Chain, t
         right = np.einsum('kp,kpab,kpa->pb', weights, slopes, values)
         offsets = np.linalg.solve(normal, right[..., None])[..., 0]
     apart = np.linalg.norm(np.einsum('kpab,pb->kpa', slopes, offsets) - values, axis=2)
-    trusted = np.sort(apart, axis=0)[:max(round(TRUSTED * len(apart)), 1)]
-    typical = np.sqrt(np.mean(np.square(trusted), axis=0))
+    mean = np.sqrt(np.mean(np.square(apart) / (1.0 + np.square(apart / DOUBTED)), axis=0))
     reach = np.linalg.norm(offsets, axis=1)
-    cost = np.where(reach > REACH, np.inf, np.hypot(typical, BESIDE * reach))
+    cost = np.where(reach > REACH, np.inf, np.hypot(mean, BESIDE * reach))
     best = int(cost.argmin())
+    trusted = np.sort(apart[:, best])[:max(round(TRUSTED * len(apart)), 1)]
     path = np.full((len(turns), 3), np.nan)
     known = np.isfinite(turns[:, 0]) & np.isfinite(hand.positions[:, 0])
     path[known] = hand.positions[known] + Rotation.from_quat(turns[known]).apply(offsets[best])
-    return _Grip(float(places[best]), float(typical[best]), float(cost[best]), path, turns)
+    return _Grip(float(places[best]), float(np.median(apart[:, best])),
+                 float(np.sqrt(np.mean(np.square(trusted)))), float(cost[best]), path, turns)
 
 
 def _own(seen: Sightings, place: float) -> Floats:
@@ -426,8 +433,8 @@ def _dragged(seen: Sightings, path: Floats, own: Floats) -> Floats:
     """
     Return the path (n, 3) [m] of a grip on the table.
 
-    There, the DLO itself shows it better than a tag beside it; where the DLO is lost, the tag shows how it moves
-    on.
+    There, the DLO itself shows it better than a tag beside it; where the DLO is lost, the tag shows how it
+    moves on.
 
     :param path: as the tag shows it, and `own` as the DLO does.
     """
@@ -455,7 +462,11 @@ def _opens(times: Floats, apart: Floats, most: float, speed: Floats, closes: int
     together = known[apart[known] < most]
     parts = [k for k in together if (apart[known[known > k][:PARTED]] >= most).all()]
     if parts and (known > parts[0]).sum() >= PARTED:
-        held = together[(together <= parts[0]) & ((apart[together] < most / 2) | (together == closes))][-1]
+        held = parts[0]
+        for before in together[together < held][::-1]:  # they begin to part
+            if not apart[held] > max(apart[before] + most / 4, most / 2):
+                break
+            held = before
         stood = together[(speed[together] < STILL) & (times[together] > times[held] - LEAVING)
                          & (together <= held)]
         return int(stood[-1] if len(stood) else held)
@@ -463,6 +474,22 @@ def _opens(times: Floats, apart: Floats, most: float, speed: Floats, closes: int
     moves = np.flatnonzero(speed[closes:held + 1] >= STILL)
     stands = min(closes + int(moves[-1]) + 1 if len(moves) else held, held)
     return int(max(stands, min(last, held)))
+
+
+def _slips(own: Floats, speed: Floats, closes: int, opens: int) -> int:
+    """
+    Return the picture in which a hand opens that stands still at last: the DLO moves only without it.
+
+    :param own: (n, 3) the place that it holds [m].
+    """
+    moves = np.flatnonzero(speed[closes:opens + 1] >= STILL)
+    stands = closes + (int(moves[-1]) + 1 if len(moves) else 0)
+    known = stands + np.flatnonzero(np.isfinite(own[stands:opens + 1, 0]))
+    if len(known) < 3:
+        return opens
+    slipped = np.linalg.norm(own[known] - own[known[:2]].mean(axis=0), axis=1) > SLIPPED
+    stays = np.flatnonzero(~slipped)
+    return int(known[stays[-1]]) if slipped[-1] and len(stays) else opens
 
 
 def _apart(seen: Sightings, grips: Floats, points: Floats, pictures: NDArray[np.bool_]) -> Floats:
@@ -476,12 +503,16 @@ def _apart(seen: Sightings, grips: Floats, points: Floats, pictures: NDArray[np.
 
 
 def _speed(times: Floats, positions: Floats) -> Floats:
-    """Return speeds (n,) [m/s]; infinite where they are unknown."""
+    """Return speeds (n,) [m/s], the slopes of straight lines over the span; infinite where unknown."""
+    speed = np.full(len(times), np.inf)
     early = np.searchsorted(times, times - SPAN - 1e-9)
-    late = np.searchsorted(times, times + SPAN + 1e-9) - 1
-    lapse = np.maximum(times[late] - times[early], 1e-9)
-    speed = np.linalg.norm(positions[late] - positions[early], axis=1) / lapse
-    return np.asarray(np.where(np.isfinite(speed), speed, np.inf))
+    late = np.searchsorted(times, times + SPAN + 1e-9)
+    for k, (begin, end) in enumerate(zip(early, late, strict=True)):
+        since = times[begin:end] - times[begin:end].mean()
+        if since.any():
+            slope = np.linalg.norm(since @ positions[begin:end]) / np.square(since).sum()
+            speed[k] = slope if np.isfinite(slope) else np.inf
+    return speed
 
 
 def _path(seen: Sightings, hold: _Hold, initial: Chain) -> Hand:

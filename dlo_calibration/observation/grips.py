@@ -29,7 +29,6 @@ from dlo_calibration.observation.plausibility import reversed_trials
 FOLLOWS, SIGMAS = 0.02, 6.0  # m, and times the noise: a gripped point further from its place is not held
 WAY = 0.05  # m; the shortest way of a hand that shows whether the DLO follows
 REACH, PLACES = 0.06, 41  # m, to both sides of the nearest place; places there that a hand may really grip
-BESIDE = 0.015  # m; a place so far along the DLO from where a hand grips moves with it
 MOST_VIEWS = 80  # goals of one grip that are compared, evenly spread
 LATEST, STEP = 0.4, 0.02  # s; the largest delay that is looked for, and the steps to it
 EXACT = 0.001  # s, standard deviation; waypoints and views are not stamped more exactly
@@ -244,8 +243,7 @@ class _Grip:
     @property
     def visible(self) -> bool:
         """Whether what it grips is seen: the DLO beside it turns about the hand, which looks late or off."""
-        near = self.beside <= BESIDE
-        return bool((np.isfinite(self.places[:, near, 0]).mean(axis=0) >= 0.5).any())
+        return bool(np.isfinite(self.places[:, self.beside.argmin(), 0]).mean() >= 0.5)
 
     def apart(self, late: Floats) -> Floats:
         """
