@@ -33,9 +33,10 @@ WAY = 0.012  # m; the shortest way of a hand that moves a DLO
 PLACES = 201  # along the DLO at which a hand may hold it
 MOST, ROUNDS = 60, 4  # pictures in which they are compared, and weightings of these
 DOUBTED = 0.006  # m; a picture in which a place is farther from where it is in the hand hardly counts
+HIDDEN = 0.05  # share of the length to both sides of a grip that fingers hide
 LEAVING = 0.6  # s; a hand that leaves a DLO stood still so long before they are apart, at most
 PARTED = 5  # pictures in a row that show hand and DLO apart
-SLIPPED = 0.0015  # m, by which a held point moves when a hand that stands still opens
+SLIPPED = 0.0015  # m, by which a held point moves beside its hand when that opens
 LEFT, SIGMAS = 0.005, 5.0  # m, and times what is typical: a grip farther from its hand is left
 HELD = 0.012  # m; from a hand to the point that it holds, at most, over most of the movement
 BESIDE = 0.005  # of a grip's distance from its tag that counts as error: of places alike, the nearest is held
@@ -332,12 +333,15 @@ def _hold(seen: Sightings, hand: HandSightings, initial: Chain, motion: Floats, 
     both = np.isfinite(own[:, 0]) & known
     apart[both] = _apart(seen, grip.path[both], own[both], both)
     opens = _opens(times, apart, min(max(LEFT, SIGMAS * grip.typical), HELD), speed, closes, last)
-    opens = _slips(own, speed, closes, opens)
+    stands = closes + np.flatnonzero(
+        np.linalg.norm(grip.path[closes:opens + 1] - grip.path[opens], axis=1) < LEFT)
+    low = grip.path if seen.cameras is None else _dragged(seen, grip.path)
+    opens = _slips(low - own, closes, opens, stands)
     held = slice(closes, opens + 1)
     moving = grip.path[held][(speed[held] >= STILL) & known[held]]
     lifts = seen.cameras is None or not len(moving) or bool(
         np.median(moving[:, 2]) - seen.radius > LIFTED)
-    path = grip.path if lifts else _dragged(seen, grip.path, own)
+    path = grip.path if lifts else _like_the_dlo(times, low, own)
     return _Hold(hand.name, grip.place, path, grip.turns, closes, opens, lifts)
 
 
@@ -429,22 +433,30 @@ def _own(seen: Sightings, place: float) -> Floats:
     return own
 
 
-def _dragged(seen: Sightings, path: Floats, own: Floats) -> Floats:
-    """
-    Return the path (n, 3) [m] of a grip on the table.
+def _dragged(seen: Sightings, path: Floats) -> Floats:
+    """Return the path (n, 3) [m] of a grip on the table, from how a tag shows it."""
+    assert seen.cameras is not None
+    share = (seen.radius - seen.cameras[:, 2:]) / (path[:, 2:] - seen.cameras[:, 2:])
+    return np.asarray(seen.cameras + share * (path - seen.cameras))
 
-    There, the DLO itself shows it better than a tag beside it; where the DLO is lost, the tag shows how it
-    moves on.
+
+def _like_the_dlo(times: Floats, path: Floats, own: Floats) -> Floats:
+    """
+    Return the smooth path (n, 3) [m] of a grip on the table as the DLO itself shows it.
+
+    That is better than a tag beside it; where the DLO is lost, the tag shows how it moves on.  A hand does not
+    tremble as the noise of single pictures does, which would shake a simulated DLO.
 
     :param path: as the tag shows it, and `own` as the DLO does.
     """
-    assert seen.cameras is not None
-    share = (seen.radius - seen.cameras[:, 2:]) / (path[:, 2:] - seen.cameras[:, 2:])
-    low = seen.cameras + share * (path - seen.cameras)
-    both = np.isfinite(own[:, 0]) & np.isfinite(low[:, 0])
-    times = seen.times
-    off = np.stack([np.interp(times, times[both], axis) for axis in (own - low)[both].T], axis=1)
-    return np.asarray(np.where(np.isfinite(own), own, low + off))
+    moves = np.where(np.isfinite(path), path, 0.0)
+    both = np.flatnonzero(np.isfinite(own[:, 0]) & np.isfinite(path[:, 0]))
+    off = (own - moves)[both]
+    smooth = np.full_like(path, np.nan)
+    for k in np.flatnonzero(np.isfinite(path[:, 0])):
+        near = np.maximum(np.exp(-np.square((times[both] - times[k]) / SPAN) / 2.0), 1e-9)
+        smooth[k] = path[k] + near @ off / near.sum()
+    return np.where(np.isfinite(smooth), smooth, own)
 
 
 def _opens(times: Floats, apart: Floats, most: float, speed: Floats, closes: int, last: int) -> int:
@@ -476,20 +488,21 @@ def _opens(times: Floats, apart: Floats, most: float, speed: Floats, closes: int
     return int(max(stands, min(last, held)))
 
 
-def _slips(own: Floats, speed: Floats, closes: int, opens: int) -> int:
+def _slips(apart: Floats, closes: int, opens: int, stands: NDArray[np.intp]) -> int:
     """
-    Return the picture in which a hand opens that stands still at last: the DLO moves only without it.
+    Return the picture in which a hand opens: the last one before the DLO begins to move without it.
 
-    :param own: (n, 3) the place that it holds [m].
+    :param apart: (n, 3) from the hand's grip to the place that it holds [m]; NaN where unknown.
+    :param stands: pictures in which the hand stands where it opens.
     """
-    moves = np.flatnonzero(speed[closes:opens + 1] >= STILL)
-    stands = closes + (int(moves[-1]) + 1 if len(moves) else 0)
-    known = stands + np.flatnonzero(np.isfinite(own[stands:opens + 1, 0]))
-    if len(known) < 3:
-        return opens
-    slipped = np.linalg.norm(own[known] - own[known[:2]].mean(axis=0), axis=1) > SLIPPED
-    stays = np.flatnonzero(~slipped)
-    return int(known[stays[-1]]) if slipped[-1] and len(stays) else opens
+    known = closes + np.flatnonzero(np.isfinite(apart[closes:opens + 1, 0]))
+    for k in range(PARTED, len(known)):
+        if known[k] not in stands:
+            continue
+        usual = np.median(apart[known[k - PARTED:k]], axis=0)
+        if (np.linalg.norm(apart[known[k:]] - usual, axis=1) > SLIPPED).all():
+            return int(known[k - 1])
+    return opens
 
 
 def _apart(seen: Sightings, grips: Floats, points: Floats, pictures: NDArray[np.bool_]) -> Floats:
@@ -569,6 +582,7 @@ def _low(seen: Sightings, holds: Sequence[_Hold], k: int) -> Floats | None:
     points = np.array(seen.points[k])
     if seen.cameras is None:
         return points
+    whole = _complete(points)
     share = np.linspace(0.0, 1.0, len(points))
     length = float(np.nansum(np.linalg.norm(np.diff(points, axis=0), axis=1))) or 1.0
     diameter = max(2.0 * seen.radius, 1e-3)
@@ -577,4 +591,8 @@ def _low(seen: Sightings, holds: Sequence[_Hold], k: int) -> Floats | None:
         if hold.lifts and hold.first <= k <= hold.last and lifted > LIFTED:
             reach = max(BUMP * diameter * (lifted / diameter) ** 0.25, SLACK * lifted)
             points[np.abs(share - hold.place) * length <= reach] = np.nan
+        elif whole is not None and not hold.lifts and hold.first <= k <= hold.last:
+            # What the fingers hide is where the path of the hand has it.
+            near = np.abs(share - hold.place) <= HIDDEN
+            points[near] = whole[near]
     return points if _usable(points) else None
