@@ -100,7 +100,7 @@ class Bag:
     def keep(self, record: Record) -> None:
         """Keep a message; the outputs of the node take at most half of the room."""
         limit = min(KEPT_MESSAGES, max(KEPT_OF_ANY, self._size // MESSAGE_OCTETS))
-        if record.type in OUTPUT_TYPES.values() and (
+        if record.type not in INPUT_TYPES.values() and (
                 2 * len(self.records) >= limit or 2 * self._octets > KEPT_OCTETS):
             return
         self._octets += len(record.data)

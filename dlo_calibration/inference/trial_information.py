@@ -30,6 +30,7 @@ from dlo_calibration.evaluation.linearisation import (
 from dlo_calibration.evaluation.pool import Pool
 from dlo_calibration.evaluation.residuals import Huber, ResidualLayout
 from dlo_calibration.inference.advice import sensitivities
+from dlo_calibration.inference.draws import drawn_points
 from dlo_calibration.inference.examination import Examination, extended
 from dlo_calibration.inference.outlier import candidate, is_outlier, SOMETHING_ELSE
 from dlo_calibration.inference.uncertainty import (
@@ -60,6 +61,8 @@ ROUNDS = 8  # Gauss-Newton steps to the best values, at most
 WORTH_A_STEP = 0.02  # share of the cost that a step must promise to save
 WORTH_A_MOVE = 0.1  # share of the cost that one of the TRIED_VALUES must save
 TRIED_VALUES = (0.15, 0.4, 0.65, 0.9)  # of a parameter whose derivative may not point to its value
+MISFIT = 2.0  # times the noise level: larger residuals let the best values be sought all over the scales
+SCATTERED = 24  # points there
 STARTS = 8  # simulations of each trial from initial chains with other noise
 #: A trial is informative if it reduces a standard deviation below this share; repeating one leaves 0.71.
 NEW = 0.6
@@ -290,10 +293,11 @@ class Appraiser:
         trials = [without_repeated_goals(trial) for trial in trials]
         models = [*before.models, *[None] * (len(trials) - len(before.models))]
         best = self._minimum(trials, models, before.point, before.uncertainty.std)
-        elsewhere = self._better_start(trials, best)
-        if elsewhere is not None:
-            other = self._minimum(trials, [None] * len(trials), elsewhere, before.uncertainty.std)
-            best = min(best, other, key=lambda minimum: best.loss.cost(minimum.residuals))
+        for better_start in (self._better_start, self._scattered_start):
+            elsewhere = better_start(trials, best)
+            if elsewhere is not None:
+                other = self._minimum(trials, [None] * len(trials), elsewhere, before.uncertainty.std)
+                best = min(best, other, key=lambda minimum: best.loss.cost(minimum.residuals))
         return self._examined(before.names, trials, best.point, tuple(
             model if model.complete else self._completed(model, trial)
             for model, trial in zip(best.models, trials, strict=True)))
@@ -354,6 +358,17 @@ class Appraiser:
             if min(costs) < (1 - WORTH_A_MOVE) * cost:
                 start, cost = points[int(np.argmin(costs))], min(costs)
         return None if start is best.point else start
+
+    def _scattered_start(self, trials: Sequence[Trial], best: _Minimum) -> Floats | None:
+        """Return the best of (d,) points all over the scales if a minimum misses the trials by far."""
+        if not best.uncertainty.residual > MISFIT * self.noise:
+            return None
+        points = drawn_points(best.point, Appraisal.before(self.space.free, best.point).uncertainty,
+                              SCATTERED, 0)
+        residuals = [self._residuals(trials, point) for point in points]
+        costs = [np.inf if each is None else best.loss.cost(each) for each in residuals]
+        # A Gauss-Newton step moves a parameter by WIDEST: a point that fits worse may still lead further.
+        return points[int(np.argmin(costs))] if np.isfinite(min(costs)) else None
 
     def _examined(self, names: tuple[str, ...], trials: Sequence[Trial], point: Floats,
                   models: tuple[TrialModel, ...]) -> Appraisal:

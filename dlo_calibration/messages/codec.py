@@ -28,6 +28,7 @@ OUTPUT_TYPES: Mapping[str, str] = {
     'progress': 'diagnostic_msgs/msg/DiagnosticArray',
     'result': 'diagnostic_msgs/msg/DiagnosticArray',
     'dlo_description': 'std_msgs/msg/String',
+    'advice': 'trajectory_msgs/msg/MultiDOFJointTrajectory',
     'status': 'diagnostic_msgs/msg/DiagnosticArray',
     'markers': 'visualization_msgs/msg/MarkerArray',
 }

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""PlanOptions: the options of a plan, declared once, here; see `calibration.options`."""
+"""The options of hands, of a plan and of advice, declared once, here; see `calibration.options`."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from dlo_calibration.calibration.options import declared, DeclaredOptions, MACHINE, SEARCH
 from dlo_calibration.errors import InputError
+from dlo_calibration.inference.target import read_targets
 from dlo_calibration.planning.limits import HANDS, Limits, REACH
 
 KINDS = ('grasp_and_place', 'drag')  # of actions
@@ -16,27 +17,14 @@ POINTS, SCORE = 'points', 'score'  # objectives
 
 
 @dataclass(frozen=True)
-class PlanOptions(DeclaredOptions):
-    """Everything that a user can set for a plan; the declarations state meaning, unit and range."""
+class HandOptions(DeclaredOptions):
+    """What hands may do, and where they and the DLO may be."""
 
-    actions: int = declared(4, 'largest number of actions of a plan; fewer win if the goal is reached with '
-                            'them', minimum=1, maximum=20, of=SEARCH)
     hands: int = declared(1, 'number of hands, hand_1 and hand_2; two act at the same time', minimum=1,
                           maximum=len(HANDS), of=SEARCH)
-    kinds: tuple[str, ...] = declared(KINDS, 'the kinds of actions that a plan may have', choices=KINDS,
+    kinds: tuple[str, ...] = declared(KINDS, 'the kinds of actions that the hands may do', choices=KINDS,
                                       of=SEARCH)
-    objective: str = declared(
-        POINTS, "what is minimised: points, the mean distance of the points from the goal; or score, this "
-        "distance and the paper's difference score per point, which counts orientation and facing",
-        choices=(POINTS, SCORE), of=SEARCH)
-    tolerance: float = declared(
-        1.0, 'the goal is reached if the mean distance of the points from it is at most this share of the '
-        'length', unit='%', minimum=0.01, maximum=100.0, of=SEARCH)
     crossings: bool = declared(False, 'whether an action may put the DLO over itself', of=SEARCH)
-    draws: int = declared(8, 'number of draws from the posterior that a plan is judged on; 0: only on the '
-                          'found parameters', minimum=0, maximum=1000, of=SEARCH)
-    seed: int = declared(1, 'random seed; the same seed gives the same plan', minimum=0, maximum=2**31 - 1,
-                         of=SEARCH)
     height: float = declared(0.05, 'lift of a grasp_and_place above the higher one of its two places',
                              unit='m', minimum=0.001, maximum=10.0, of=MACHINE)
     speed: float = declared(0.1, 'speed of the hands', unit='m/s', minimum=0.001, maximum=10.0, of=MACHINE)
@@ -56,8 +44,6 @@ class PlanOptions(DeclaredOptions):
     most_tension: float = declared(
         0.0, 'largest tension that actions may cause in the DLO, likewise; 0: any', unit='N', minimum=0.0,
         maximum=1e6, of=MACHINE)
-    workers: int = declared(0, 'number of threads that simulate; 0: one per core', minimum=0, maximum=1024,
-                            of=MACHINE)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -74,3 +60,42 @@ class PlanOptions(DeclaredOptions):
         :raises InputError: if one of the options cannot be read.
         """
         return Limits.read(self.reach_1, self.reach_2, self.no_go, self.least_bend_radius, self.most_tension)
+
+
+@dataclass(frozen=True)
+class PlanOptions(HandOptions):
+    """Everything that a user can set for a plan."""
+
+    actions: int = declared(4, 'largest number of actions of a plan; fewer win if the goal is reached with '
+                            'them', minimum=1, maximum=20, of=SEARCH)
+    objective: str = declared(
+        POINTS, "what is minimised: points, the mean distance of the points from the goal; or score, this "
+        "distance and the paper's difference score per point, which counts orientation and facing",
+        choices=(POINTS, SCORE), of=SEARCH)
+    tolerance: float = declared(
+        1.0, 'the goal is reached if the mean distance of the points from it is at most this share of the '
+        'length', unit='%', minimum=0.01, maximum=100.0, of=SEARCH)
+    draws: int = declared(8, 'number of draws from the posterior that a plan is judged on; 0: only on the '
+                          'found parameters', minimum=0, maximum=1000, of=SEARCH)
+    seed: int = declared(1, 'random seed; the same seed gives the same plan', minimum=0, maximum=2**31 - 1,
+                         of=SEARCH)
+    workers: int = declared(0, 'number of threads that simulate; 0: one per core', minimum=0, maximum=1024,
+                            of=MACHINE)
+
+
+@dataclass(frozen=True)
+class AdviceOptions(HandOptions):
+    """Everything that a user can set for advice, besides the options of the calibration."""
+
+    wanted: str = declared(
+        '', "how certain the parameters shall become: names and half widths of their 90 % intervals, on the "
+        "0..100 scale or in percent of the physical value, e.g. 'flexibility 2, friction 3' or 'EI 5 %'; "
+        'empty: each one that is calibrated shall be identifiable', of=MACHINE)
+    pause: float = declared(
+        2.0, 'how long the hands wait in the advised action before they put the DLO down, or open, so that '
+        'it is observed there, too; 0: it is observed only after they have opened', unit='s', minimum=0.0,
+        maximum=60.0, of=MACHINE)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        read_targets(self.wanted)

@@ -24,13 +24,12 @@ from std_srvs.srv import Trigger
 
 from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.calibration.engines import SimulatorFactory
-from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.messages.codec import INPUT_TYPES, OUTPUT_TYPES
 from dlo_calibration.messages.collector import MARGIN
 from dlo_calibration.model.pose import NUMBERS, Pose
 from dlo_calibration.ros.graph_node import GraphNode, SLICE
-from dlo_calibration.ros.session import CalibrationSession
+from dlo_calibration.ros.session import CalibrationSession, CalibratorOptions
 
 LIMIT = 64_000_000  # bytes that wait: 100,000 chains of 40 points, and little of the 1 GB of a small robot
 OVERHEAD = 200  # bytes of a waiting message, besides its content
@@ -136,7 +135,7 @@ class TableFrame:
         """Whether the pose is needed and not known yet."""
         return self._name is not None and self.pose is None
 
-    def choose(self, options: Options) -> None:
+    def choose(self, options: CalibratorOptions) -> None:
         """
         Use the options from now on.
 
@@ -153,7 +152,7 @@ class TableFrame:
             self._listener = TransformListener(self._buffer, self._node)
         self._name, self.pose = options.table_frame, None
 
-    def applied(self, options: Options) -> Options:
+    def applied(self, options: CalibratorOptions) -> CalibratorOptions:
         """Return the options with the pose in place of the name; none while it is missing."""
         if options.table_frame is None:
             return options
@@ -176,7 +175,7 @@ class TableFrame:
 ANSWER = 0.1  # s for waiting messages before a request is answered, of 0.2 s for the whole
 
 
-class CalibratorNode(GraphNode[Options]):
+class CalibratorNode(GraphNode[CalibratorOptions]):
     """
     The node `calibrator`; it is the `NodeInterface` of its session.
 
@@ -188,7 +187,7 @@ class CalibratorNode(GraphNode[Options]):
     queue = 1000  # holds a burst of goal chains while another callback works, and at most 320 MB
 
     def __init__(self, make_simulator: SimulatorFactory = make_chosen_simulator, **arguments: Any) -> None:
-        super().__init__('calibrator', Options, INPUT_TYPES, **arguments)
+        super().__init__('calibrator', CalibratorOptions, INPUT_TYPES, **arguments)
         self._frame, self._changed = TableFrame(self), False
         try:
             self._frame.choose(super().options())
@@ -226,11 +225,11 @@ class CalibratorNode(GraphNode[Options]):
         self.session.drop(self._inbox.take_dropped())
         self.session.close()
 
-    def options(self) -> Options:
+    def options(self) -> CalibratorOptions:
         """Return the options in force; the pose of a named frame is looked up."""
         return self._frame.applied(super().options())
 
-    def changed(self, names: Sequence[str], options: Options) -> None:
+    def changed(self, names: Sequence[str], options: CalibratorOptions) -> None:
         """Apply new values before the next message; log that a calibration under way keeps the old ones."""
         if 'frame_pose' in names:
             self._frame.choose(options)

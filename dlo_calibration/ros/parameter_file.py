@@ -18,15 +18,16 @@ import sys
 import textwrap
 from typing import Mapping
 
-from dlo_calibration.calibration.options import Declaration, DeclaredOptions, Options
+from dlo_calibration.calibration.options import Declaration, DeclaredOptions
 from dlo_calibration.ros.planner_session import PlannerOptions
+from dlo_calibration.ros.session import CalibratorOptions
 from dlo_calibration.ros.tracker_session import TrackerOptions
 
 NO_TEXTS = ['']  # an empty list of texts as a parameter: ROS cannot distinguish it from other empty lists
 
 #: name of a node -> its options
 NODES: Mapping[str, type[DeclaredOptions]] = {
-    'calibrator': Options, 'planner': PlannerOptions, 'tracker': TrackerOptions}
+    'calibrator': CalibratorOptions, 'planner': PlannerOptions, 'tracker': TrackerOptions}
 
 HEAD = """\
 All parameters of the node {node}, with their defaults.  To change some, copy this file, edit the copy

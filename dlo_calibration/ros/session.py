@@ -15,32 +15,61 @@ from dataclasses import dataclass, field
 import time
 from typing import Any, Callable, Iterator, Mapping
 
+import numpy as np
+
 from dlo_calibration.calibration.choice import choose
 from dlo_calibration.calibration.engines import SimulatorFactory
-from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.options import DeclaredOptions, Options
 from dlo_calibration.calibration.passport import Passport
 from dlo_calibration.calibration.result import CalibrationResult
-from dlo_calibration.errors import InputError, safe_line
+from dlo_calibration.errors import InputError, safe_line, SimulationError
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.files.result import description_document
 from dlo_calibration.inference.trial_information import TrialInformation
 from dlo_calibration.messages.codec import (
+    action_trajectory,
+    ChainMessage,
     GOAL,
     INITIAL,
     INPUT_TYPES,
     Message,
     MessageTypes,
+    NANOSECONDS,
     OUTPUT_TYPES,
     read,
 )
 from dlo_calibration.messages.collector import KEPT, StampOrder, TrialCollector, went_back
+from dlo_calibration.messages.encoder import action_message
+from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.trial import Trial
+from dlo_calibration.planning.options import AdviceOptions
 from dlo_calibration.ros import diagnostics
 from dlo_calibration.ros.markers import alike, markers, shown_obstacles
 from dlo_calibration.ros.node_session import NodeInterface, NodeSession, NodeState, refusal_text
 from dlo_calibration.ros.recorder import Recorder
-from dlo_calibration.workspace.live_information import LiveInformation
+from dlo_calibration.workspace.live_information import Appraised, LiveInformation
+from dlo_calibration.workspace.next_action import next_action, NextAction
 from dlo_calibration.workspace.worker import CalibrationWarning, Failure, Progress, Worker
+
+
+@dataclass(frozen=True)
+class CalibratorOptions(Options, AdviceOptions):
+    """Everything that a user of the node can set: options of the calibration, and of the advice."""
+
+    @property
+    def of_calibration(self) -> Options:
+        """Those of the calibration alone, which sessions record."""
+        return Options.of(_some(self, Options))
+
+    @property
+    def of_advice(self) -> AdviceOptions:
+        """Those of the advice alone."""
+        return AdviceOptions.of(_some(self, AdviceOptions))
+
+
+def _some(options: DeclaredOptions, kind: type[DeclaredOptions]) -> dict[str, Any]:
+    values = options.flat()
+    return {declaration.name: values[declaration.name] for declaration in kind.declarations()}
 
 
 @dataclass
@@ -91,6 +120,11 @@ class SessionState(NodeState):
     :param information: what the newest trial adds.
     :param markers: when to send the markers.
     :param renewal: when to renew `information`.
+    :param advice: what to do next; None: unknown yet.
+    :param asked: where the DLO rested for which advice was sought last.
+    :param resting: the newest chain, where no action followed it.
+    :param first: time of the first advice [s].
+    :param minutes_left: until what is wanted is reached, at the speed so far; nan: unknown.
     """
 
     name: str = 'collecting'
@@ -102,6 +136,11 @@ class SessionState(NodeState):
     dropped: Dropped = field(default_factory=Dropped)
     markers: Pace = field(default_factory=Pace)
     renewal: Pace = field(default_factory=Pace)
+    advice: NextAction | None = None
+    asked: Chain | None = None
+    resting: Chain | None = None
+    first: float | None = None
+    minutes_left: float = float('nan')
 
 
 @dataclass
@@ -166,7 +205,7 @@ class Outlet:
     :param clock: a monotonic clock [s].
     """
 
-    def __init__(self, graph: NodeInterface[Options], types: MessageTypes, recorder: Recorder,
+    def __init__(self, graph: NodeInterface[CalibratorOptions], types: MessageTypes, recorder: Recorder,
                  clock: Callable[[], float]) -> None:
         self._graph, self._types, self._recorder, self._clock = graph, types, recorder, clock
         # In the last markers: the result, the trials and the scene.
@@ -211,12 +250,13 @@ class Outlet:
                                      obstacles=shown_obstacles(scene)))
 
 
+ELSEWHERE = 0.01  # m that the points of a DLO at rest move on average, if it was moved
 QUIET = 0.5  # s without action or goal chain, after which the last trial counts as complete
 PATIENCE = 10.0  # s that closing waits for each worker
 UNDER_WAY = 1.0  # s for which messages from before a jump of the clock may still arrive
 
 
-class CalibrationSession(NodeSession[Options]):
+class CalibrationSession(NodeSession[CalibratorOptions]):
     """
     Collects trials, calibrates on request, and publishes progress, result, status and markers.
 
@@ -227,14 +267,14 @@ class CalibrationSession(NodeSession[Options]):
     :param clock: a monotonic clock [s].
     """
 
-    def __init__(self, graph: NodeInterface[Options], types: MessageTypes, make_simulator: SimulatorFactory,
-                 clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, graph: NodeInterface[CalibratorOptions], types: MessageTypes,
+                 make_simulator: SimulatorFactory, clock: Callable[[], float] = time.monotonic) -> None:
         super().__init__(graph, types, INPUT_TYPES, SessionState(), clock)
         self._state: SessionState
         self.requests = {'start': self._start, 'stop': self._stop, 'reset': self._reset,
                          'discard_last': self._discard_last}
         self._make_simulator = make_simulator
-        self.collecting = Collecting(graph.options())
+        self.collecting = Collecting(graph.options().of_calibration)
         self._worker = Worker(make_simulator)
         self._live_information = LiveInformation(make_simulator)
         self._recorder = Recorder(self._fail_to_record, make_simulator)
@@ -273,6 +313,8 @@ class CalibrationSession(NodeSession[Options]):
             self._state.heard = self._clock()
             self._state.markers.wanted = self._state.renewal.wanted = True
         refusal = refusal if message is None else self._collect(message)
+        if message and not refusal:
+            self._take_place(message)
         if refusal:
             self.refuse(refusal)
         elif not self.calibrating and (self._state.name != 'done' or kind != GOAL):  # a tracker goes on
@@ -309,7 +351,7 @@ class CalibrationSession(NodeSession[Options]):
 
     def change_options(self) -> None:
         """Use the options in force from now on; `collect_anew` collects the messages so far with them."""
-        self.collecting.change(self._graph.options())
+        self.collecting.change(self._graph.options().of_calibration)
 
     def collect_anew(self) -> None:
         """Collect one message anew; new messages wait until `collecting.left` is 0."""
@@ -372,7 +414,7 @@ class CalibrationSession(NodeSession[Options]):
         """Begin another session because the clock went back."""
         self._order, self._began = StampOrder(self._order), self._clock()
         if self._state.heard == float('-inf'):  # only initial chains came: there is no session to keep
-            self.collecting = Collecting(self._graph.options())
+            self.collecting = Collecting(self._graph.options().of_calibration)
             self._graph.warn(why)
             return
         count, folder = self._collector.count, self._recorder.folder
@@ -448,6 +490,7 @@ class CalibrationSession(NodeSession[Options]):
         state, count = self._state, self._collector.count
         self._live_information.stop()
         state.name, state.detail, state.information = 'collecting', '', None
+        state.advice = state.asked = None
         state.renewal.wanted = True
         self._show()
         which = f'trial {before}' if count < before else 'the incomplete trial'
@@ -458,7 +501,7 @@ class CalibrationSession(NodeSession[Options]):
         self._report_dropped(at_once=True)
         self._recorder.end()
         self._live_information.stop()
-        self.collecting = Collecting(self._graph.options())
+        self.collecting = Collecting(self._graph.options().of_calibration)
         self._warn(self._state.counted.rest())
         self._status = {}  # the next one is about another session
         self._state = SessionState('calibrating' if self.calibrating else 'collecting')
@@ -505,19 +548,102 @@ class CalibrationSession(NodeSession[Options]):
         state.markers = Pace(wanted=True)  # at the next tick
         self._report()
 
+    def _take_place(self, message: Message) -> None:
+        """Keep the newest chain, until an action moves the DLO."""
+        pose = self._collector.pose
+        self._state.resting = None if not isinstance(message, ChainMessage) else \
+            message.chain if pose is None else pose.chain(message.chain)
+
+    def _place(self) -> Chain | None:
+        """Return where the DLO rests, as far as is known; None while it moves, or a hand holds it."""
+        state, collector = self._state, self._collector
+        if state.resting is None or collector.incomplete or not collector.count:
+            return state.resting
+        goal = collector.trials[-1].goals[-1]
+        return goal.chain if goal.stable and not goal.held_by else None
+
     def _renew_information(self) -> None:
         """Take new information; begin to renew it if trials have changed and no calibration is under way."""
         state, now = self._state, self._clock()
-        for information in self._live_information.waiting_information():
-            if self._is_about_newest(information):
-                state.information = information
+        for event in self._live_information.waiting_events():
+            if isinstance(event, NextAction):
+                self._advise(event)
+            elif isinstance(event, TrialInformation) and self._is_about_newest(event):
+                state.information = event
         quiet = now - state.heard > QUIET
+        if quiet and not state.renewal.wanted and not self.behind and not self.calibrating \
+                and not self._live_information.alive and now - state.renewal.last > QUIET:
+            self._seek_advice(now)
         # While messages keep coming, a renewal every two seconds leaves the processor to other programs.
         if state.renewal.wanted and not self.behind and not self.calibrating and self._collector.count \
                 and not self._live_information.alive \
                 and (quiet or now - state.renewal.last > 2.0):
             state.renewal = Pace(wanted=not quiet, last=now)
-            self._live_information.start(self._collector.trials, self._graph.options(), state.result, quiet)
+            place = self._place() if quiet else None
+            state.asked = place
+            self._live_information.start(
+                self._collector.trials, self._graph.options().of_calibration, state.result, quiet,
+                None if place is None else self._asking(place))
+
+    def _seek_advice(self, now: float) -> None:
+        """Seek advice from where the DLO rests now, if that is elsewhere than the last time."""
+        state = self._state
+        state.renewal.last = now
+        place = self._place()
+        if place is None or state.name == 'done' or state.asked is not None and (
+                len(place) == len(state.asked)
+                and np.nanmean(np.linalg.norm(place.points - state.asked.points, axis=1)) < ELSEWHERE):
+            return
+        state.asked = place
+        self._live_information.start(self._collector.trials, self._graph.options().of_calibration,
+                                     state.result, then=self._asking(place))
+
+    def _asking(self, place: Chain) -> Callable[[Appraised, Options, Callable[[], bool]], NextAction]:
+        limits, make = self._graph.options().of_advice, self._make_simulator
+
+        def ask(appraised: Appraised, options: Options, should_stop: Callable[[], bool]) -> NextAction:
+            try:
+                return next_action(appraised, options, limits, place, make, should_stop)
+            except (InputError, SimulationError) as error:
+                return NextAction.failed(options.space.free, str(error))
+
+        return ask
+
+    def _advise(self, advice: NextAction) -> None:
+        """Publish advice; where something is wanted and no action is left, calibrate."""
+        state, collector = self._state, self._collector
+        state.advice = advice
+        state.first = self._clock() if state.first is None else state.first
+        if collector.count:
+            state.minutes_left = advice.trials * (self._clock() - state.first) / collector.count / 60
+        pose, stamp = collector.pose, self._graph.stamp() or NANOSECONDS
+        if advice.action is None:
+            message = self._types.build(OUTPUT_TYPES['advice'], points=[], joint_names=[],
+                                        header=self._types.header(stamp, collector.frame_id))
+        else:
+            action = advice.action if pose is None else pose.inverse.action(advice.action)
+            message = action_trajectory(self._types, action_message(action.hands, stamp, collector.frame_id))
+        self._outlet.send('advice', message)
+        self._graph.info(f'next: {advice.words}')
+        if advice.action is None and advice.complete and self._graph.options().wanted and collector.count \
+                and not state.started:
+            try:
+                self._graph.info(self._start())
+            except InputError as error:
+                self.refuse(str(error))
+
+    @property
+    def _told(self) -> dict[str, Any]:
+        """Return what the status says about advice."""
+        advice = self._state.advice
+        if advice is None:
+            return {}
+        told: dict[str, Any] = {'advice': advice.words, 'trials_left': advice.trials,
+                                'minutes_left': self._state.minutes_left}
+        for name, (now, then, wanted) in advice.distances.items():
+            told.update({f'half_width_{name}': now, f'expected_half_width_{name}': then,
+                         f'wanted_half_width_{name}': wanted})
+        return told
 
     def _is_about_newest(self, information: TrialInformation | None) -> bool:
         """Tell whether information is about the newest trial; which others may follow."""
@@ -537,7 +663,7 @@ class CalibrationSession(NodeSession[Options]):
         content: dict[str, Any] = {
             'state': state.name, 'trials': collector.count, 'last_refusal': state.last_refusal,
             'incomplete': collector.incomplete, 'detail': ANEW if self.collecting.left else state.detail,
-            'dropped': state.dropped.reported.total()}
+            'dropped': state.dropped.reported.total(), **self._told}
         about = state.information if self._is_about_newest(state.information) else None
         if self._status_is_due({**content, 'about': about}, 'last_refusal', 'incomplete', 'dropped'):
             self._outlet.send('status', diagnostics.status(self._types, self._graph.stamp(), content, about))
@@ -546,7 +672,7 @@ class CalibrationSession(NodeSession[Options]):
         self._outlet.markers(self._state, self._collector, at_once)
 
     def _begin_recording(self) -> None:
-        self._recorder.begin(self._graph.options())
+        self._recorder.begin(self._graph.options().of_calibration)
         if self._recorder.folder is not None:
             self._graph.info(f'recording to {self._recorder.folder}')
 

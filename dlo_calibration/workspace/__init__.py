@@ -6,11 +6,13 @@ A calibration under way and its folder; command line, node and capture page are 
 
 `source` reads a session or a request, `worker` calibrates in a thread, and `folder` has the input and the log
 of a calibration until its result is complete, then the files of the result; `validation` tries a result on
-other trials, and `check` tells whether they show the same DLO.
+other trials, and `check` tells whether they show the same DLO.  `next_action` advises what hands do next.
 """
 
 from dlo_calibration.workspace.folder import CalibrationFolder
+from dlo_calibration.workspace.next_action import advise, NextAction
 from dlo_calibration.workspace.source import read_source, Selection, Source
 from dlo_calibration.workspace.worker import Progress, Worker
 
-__all__ = ['CalibrationFolder', 'Progress', 'Selection', 'Source', 'Worker', 'read_source']
+__all__ = ['CalibrationFolder', 'NextAction', 'Progress', 'Selection', 'Source', 'Worker', 'advise',
+           'read_source']

@@ -17,6 +17,7 @@ from dlo_calibration.cli import main
 from dlo_calibration.cli.arguments import PREFIX
 from dlo_calibration.files.result import read_result
 from dlo_calibration.messages.codec import OUTPUT_TYPES
+from dlo_calibration.planning.options import AdviceOptions, HandOptions
 from dlo_calibration.planning.plan import plain_plan
 from dlo_calibration.ros import planner_session, tracker_session
 from dlo_calibration.ros.planner_session import PlannerOptions
@@ -37,9 +38,15 @@ def sections():
     return dict(part.split('\n', 1) for part in text.split('\n## ')[1:])
 
 
+#: The limits of the hands are documented once, with the planner.
+OF_ADVICE = tuple(declaration for declaration in AdviceOptions.declarations()
+                  if declaration not in HandOptions.declarations())
+
+
 @pytest.mark.parametrize('heading, declared', [
-    ('Parameters', Options.declarations()), ('The planner', PlannerOptions.declarations()),
-    ('The tracker', TrackerOptions.declarations())], ids=['calibrator', 'planner', 'tracker'])
+    ('Parameters', Options.declarations()), ('Advice', OF_ADVICE),
+    ('The planner', PlannerOptions.declarations()),
+    ('The tracker', TrackerOptions.declarations())], ids=['calibrator', 'advice', 'planner', 'tracker'])
 def test_every_parameter_is_documented_as_it_is_declared(heading, declared):
     row = re.compile(r'^\| `(\w+)` \| (.*?) \| (.*?) \| (.*?) \| (.*?) \|$', re.MULTILINE)
     table = {name: rest for name, *rest in row.findall(sections()[heading])}

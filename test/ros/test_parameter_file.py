@@ -10,8 +10,8 @@ import sys
 import pytest
 from ruamel.yaml import YAML
 
-from dlo_calibration.calibration.options import Options
 from dlo_calibration.ros.parameter_file import NO_TEXTS, NODES, parameter_file
+from dlo_calibration.ros.session import CalibratorOptions
 
 ROOT = Path(__file__).resolve().parents[2]
 FILE = ROOT / 'config' / 'calibrator.yaml'
@@ -80,7 +80,7 @@ def test_node_starts_with_the_file_and_uses_its_changed_values(ros_environment, 
                    signal_handler_options=SignalHandlerOptions.NO)
         try:
             node = CalibratorNode(context=context)
-            assert node.options() == Options.of({'output_directory': str(tmp_path), **expected})
+            assert node.options() == CalibratorOptions.of({'output_directory': str(tmp_path), **expected})
             node.close()
         finally:
             context.try_shutdown()

@@ -8,10 +8,9 @@ import time
 
 from toy_messages import MINUTE
 
-from dlo_calibration.calibration.options import Options
 from dlo_calibration.files.record import encode, typestore
 from dlo_calibration.messages.codec import bag_types, INPUT_TYPES, OUTPUT_TYPES
-from dlo_calibration.ros.session import CalibrationSession
+from dlo_calibration.ros.session import CalibrationSession, CalibratorOptions
 
 PATIENCE = 60.0  # s
 TYPES = bag_types()
@@ -89,7 +88,7 @@ class ToyGraph(ToyNode):
         self.session.status_period = status_period
 
     def options(self):
-        return Options.of({**Options().flat(), **self.set})
+        return CalibratorOptions.of({**CalibratorOptions().flat(), **self.set})
 
     def calibrated(self):
         """Start, and return the result."""

@@ -1,0 +1,187 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+How many trials a robot needs that asks its own questions, compared with two that do not.
+
+    python benchmark/self_calibration.py [--objects N] [--seeds N] [--all-wanted]
+
+Each object is a rope with random properties from the middle of the scale, played with physics of its own
+(examples/played_rope.py: twice the nodes, half the time step, noise of 1.5 mm, grips off by up to 5 mm, 5 %
+of the points hidden).  The robot has one hand that lifts 10 cm, and ends when its own intervals are as narrow
+as wanted.  It does what `advise` says, or random permitted actions, or those of the guide in turn.  The full
+calibration at that moment tells whether its intervals hold the truth.  The tables are printed, and written to
+benchmark/results/self_calibration.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass, field
+from pathlib import Path
+import sys
+import time
+from typing import Sequence
+
+import numpy as np
+
+HERE = Path(__file__).resolve().parent
+sys.path[:0] = [str(HERE), str(HERE.parent / 'examples')]
+
+from figures import machine, table  # noqa: E402
+from played_rope import observed_trial, PlayedRope  # noqa: E402
+
+from dlo_calibration import calibrate, Chain, Options, Trial  # noqa: E402
+from dlo_calibration.calibration.choice import choose  # noqa: E402
+from dlo_calibration.calibration.engines import make_simulator  # noqa: E402
+from dlo_calibration.inference.target import wanted_deviations  # noqa: E402
+from dlo_calibration.model.action import Action  # noqa: E402
+from dlo_calibration.observation.table import lowest_level  # noqa: E402
+from dlo_calibration.planning.inquiry import Inquiries, Inquiry  # noqa: E402
+from dlo_calibration.planning.options import AdviceOptions  # noqa: E402
+from dlo_calibration.planning.surroundings import Surroundings  # noqa: E402
+from dlo_calibration.workspace.live_information import appraise, Appraised  # noqa: E402
+from dlo_calibration.workspace.next_action import LEAST_TRIALS, next_action, NextAction  # noqa: E402
+
+MIDDLE = (25.0, 75.0)  # of the scale
+WANTED = 'flexibility 2, friction 3'
+ALL_WANTED = 'flexibility 2, friction 3, elasticity 5, self_collision 5'
+MOST = 12  # trials
+ASKS, RANDOM, GUIDE = 'advise', 'random', 'guide'
+
+
+@dataclass
+class Session:
+    """What one robot did with one object."""
+
+    robot: str
+    truth: dict[str, float]
+    trials: int = 0
+    reached: bool = False
+    seconds: list[float] = field(default_factory=list)  # until the next advice
+    ratios: list[float] = field(default_factory=list)  # expected / found standard deviations
+    live: list[bool] = field(default_factory=list)  # whether the live intervals hold the truth at the end
+    held: list[bool] = field(default_factory=list)  # whether those of the full calibration do
+    course: list[tuple[float, ...]] = field(default_factory=list)  # standard deviations after each trial
+    said: str = ''
+
+
+def rope_of(seed: int, draw: int) -> PlayedRope:
+    """Return an object with random properties; `draw` changes what the camera sees."""
+    generator = np.random.default_rng(seed)
+    values = {name: float(generator.uniform(*MIDDLE)) for name in Options().space.free}
+    return PlayedRope(values, np.random.default_rng([seed, draw]), length=float(generator.uniform(0.5, 0.9)),
+                      turn=float(generator.uniform(-1.5, 1.5)))
+
+
+def guided(inquiries: Sequence[Inquiry], count: int, points: int) -> Inquiry:
+    """Return the next action of the guide: lift the middle, drag a quarter, place an end, in turn."""
+    middle, quarter = points // 2, points // 4
+    grip, kind, lifted = ((middle, 'grasp_and_place', True), (quarter, 'drag', False),
+                          (0, 'grasp_and_place', False))[count % 3]
+    fitting = [inquiry for inquiry in inquiries if abs(inquiry.move.grips[0] - grip) <= 1
+               and inquiry.move.name == kind and (np.abs(inquiry.move.shifts).max() == 0) == lifted]
+    return (fitting or inquiries)[-1]
+
+
+def chosen(robot: str, appraised: Appraised, options: Options, limits: AdviceOptions, start: Chain,
+           generator: np.random.Generator) -> tuple[Action, tuple[float, float] | None]:
+    """Return the action of a robot that does not ask."""
+    inquiries = Inquiries(start, lowest_level(start), limits, Surroundings())
+    coarse = inquiries.coarse()
+    inquiry = guided(coarse, len(appraised.trials), len(start)) if robot == GUIDE else \
+        coarse[int(generator.integers(len(coarse)))]
+    return inquiry.action, inquiry.pause
+
+
+def conducted(robot: str, seed: int, draw: int, limits: AdviceOptions) -> Session:
+    """Let a robot calibrate an object."""
+    rope, generator = rope_of(seed, draw), np.random.default_rng([seed, draw, 7])
+    session, trials = Session(robot, rope.values), list[Trial]()
+    appraisals: dict = {}  # type: ignore[type-arg]
+    names = [name for name in Options().space.free if name in limits.wanted]
+    expected = None
+    while True:
+        begun = time.process_time()
+        options = choose(trials, Options(workers=2)).options
+        space = options.space
+        appraised = appraise(make_simulator, trials, options, None, appraisals)
+        std = appraised.appraisal.uncertainty.std
+        wanted = wanted_deviations(limits.wanted, space)
+        session.course.append(tuple((std * 164.5).round(1).tolist()))
+        columns = [space.free.index(name) for name in names]
+        if expected is not None:
+            session.ratios += [float(expected[k] / std[k]) for k in columns]
+        session.reached = bool((std <= wanted).all()) and len(trials) >= LEAST_TRIALS
+        start = Chain(rope.look())
+        start = start.interpolated(start.arc_lengths())
+        advice: NextAction | None = None
+        if robot == ASKS:
+            advice = next_action(appraised, options, limits, start, make_simulator)
+            expected = advice.expected
+            session.seconds.append(time.process_time() - begun)
+        if session.reached or len(trials) == MOST or advice is not None and advice.action is None:
+            break
+        if advice is not None and advice.action is not None:
+            action, pause = advice.action, advice.pause
+        else:
+            action, pause = chosen(robot, appraised, options, limits, start, generator)
+        trials.append(observed_trial(f'trial {len(trials) + 1}', rope, action, pause))
+    session.trials, session.said = len(trials), '' if advice is None else advice.words
+    truth = space.point(rope.values)
+    appraisal = appraised.appraisal
+    session.live = [bool(appraisal.uncertainty.lower[k] <= truth[k] <= appraisal.uncertainty.upper[k])
+                    for k in columns]
+    result = calibrate(trials, Options(workers=2, engine='compiled'))
+    session.held = [result.parameters[name].lower <= rope.values[name] <= result.parameters[name].upper
+                    for name in names]
+    return session
+
+
+def main() -> None:
+    """Make the tables."""
+    parser = argparse.ArgumentParser(description=__doc__.partition('\n\n')[0].strip())
+    parser.add_argument('--objects', type=int, default=20)
+    parser.add_argument('--seeds', type=int, default=5)
+    parser.add_argument('--first', type=int, default=1, help='seed of the first object')
+    parser.add_argument('--all-wanted', action='store_true', help='want elasticity and self_collision, too')
+    parser.add_argument('--robots', nargs='+', default=[ASKS, RANDOM, GUIDE])
+    chosen = parser.parse_args()
+    limits = AdviceOptions(wanted=ALL_WANTED if chosen.all_wanted else WANTED, height=0.1)
+    sessions = []
+    for seed in range(chosen.first, chosen.first + chosen.objects):
+        for draw in range(chosen.seeds):
+            for robot in chosen.robots:
+                session = conducted(robot, seed, draw, limits)
+                sessions.append(session)
+                print(f'object {seed}, draw {draw + 1}:', session, flush=True)
+    columns = ('robot', 'sessions', 'trials, median', 'trials, mean', 'ended by its intervals',
+               'truth in the intervals', 'truth in the live ones', 'expected / found std, median',
+               'most processor seconds to an advice')
+    rows = []
+    for robot in chosen.robots:
+        own = [session for session in sessions if session.robot == robot]
+        ratios = [ratio for session in own for ratio in session.ratios]
+        seconds = [each for session in own for each in session.seconds]
+        rows.append((
+            robot, len(own), f'{np.median([session.trials for session in own]):g}',
+            f'{np.mean([session.trials for session in own]):.1f}', percent([each.reached for each in own]),
+            percent([held for session in own for held in session.held]),
+            percent([held for session in own for held in session.live]),
+            f'{np.median(ratios):.2f}' if ratios else '-', f'{max(seconds):.1f}' if seconds else '-'))
+    text = table(columns, rows)
+    command = (f'python benchmark/self_calibration.py --objects {chosen.objects} --seeds {chosen.seeds}'
+               + f' --first {chosen.first}' * (chosen.first > 1) + ' --all-wanted' * chosen.all_wanted)
+    how = f'Wanted: {limits.wanted}; at most {MOST} trials. {machine()}'
+    (HERE / 'results' / f'self_calibration{"_all" * chosen.all_wanted}.md').write_text(
+        f'# self_calibration\n\n`{command}`\n\n{how}\n\n{text}\n', encoding='utf-8')
+    print(text)
+
+
+def percent(told: Sequence[bool]) -> str:
+    """Return the share that is True."""
+    return f'{100 * np.mean(told):.0f} %'
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,34 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Draws from what is known of the parameters before a calibration."""
+
+from __future__ import annotations
+
+from statistics import NormalDist
+
+import numpy as np
+
+from dlo_calibration.inference.uncertainty import Uncertainty, UNKNOWN_STD
+from dlo_calibration.model.chain import Floats
+
+EDGE = 0.05  # from the ends of the scale, where no draw lies
+
+
+def drawn_points(point: Floats, uncertainty: Uncertainty, count: int, seed: int) -> Floats:
+    """
+    Return draws, (count, d), of what is known: a Latin hypercube, so that few draws cover each parameter.
+
+    :param point: (d,) the best values in the unit cube; a parameter of which nothing is known does not keep
+        to its value.
+    """
+    generator = np.random.default_rng(seed)
+    shares = (np.argsort(generator.random((count, len(point))), axis=0) + 0.5) / count
+    normal = np.vectorize(NormalDist().inv_cdf)(shares)
+    covariance = uncertainty.covariance
+    if covariance is None:
+        covariance = np.diag(uncertainty.std**2)
+    values, axes = np.linalg.eigh(covariance)
+    drawn = point + normal @ (axes * np.sqrt(np.maximum(values, 0.0))).T
+    unknown = uncertainty.std > 0.95 * UNKNOWN_STD
+    return np.clip(np.where(unknown, shares, drawn), EDGE, 1 - EDGE)
