@@ -33,6 +33,7 @@ WAY = 0.012  # m; the shortest way of a hand that moves a DLO
 PLACES = 201  # along the DLO at which a hand may hold it
 MOST, ROUNDS = 60, 4  # pictures in which they are compared, and weightings of these
 DOUBTED = 0.006  # m; a picture in which a place is farther from where it is in the hand hardly counts
+BRIDGED = 0.2  # share of the length to both sides of a place, in which the DLO must be seen
 HIDDEN = 0.05  # share of the length to both sides of a grip that fingers hide
 LEAVING = 0.6  # s; a hand that leaves a DLO stood still so long before they are apart, at most
 PARTED = 5  # pictures in a row that show hand and DLO apart
@@ -332,7 +333,8 @@ def _hold(seen: Sightings, hand: HandSightings, initial: Chain, motion: Floats, 
     apart = np.full(len(times), np.nan)
     both = np.isfinite(own[:, 0]) & known
     apart[both] = _apart(seen, grip.path[both], own[both], both)
-    opens = _opens(times, apart, min(max(LEFT, SIGMAS * grip.typical), HELD), speed, closes, last)
+    way = np.linalg.norm(hand.positions - hand.positions[closes], axis=1)
+    opens = _opens(times, apart, min(max(LEFT, SIGMAS * grip.typical), HELD), speed, way, closes, last)
     stands = closes + np.flatnonzero(
         np.linalg.norm(grip.path[closes:opens + 1] - grip.path[opens], axis=1) < LEFT)
     low = grip.path if seen.cameras is None else _dragged(seen, grip.path)
@@ -341,7 +343,7 @@ def _hold(seen: Sightings, hand: HandSightings, initial: Chain, motion: Floats, 
     moving = grip.path[held][(speed[held] >= STILL) & known[held]]
     lifts = seen.cameras is None or not len(moving) or bool(
         np.median(moving[:, 2]) - seen.radius > LIFTED)
-    path = grip.path if lifts else _like_the_dlo(times, low, own)
+    path = grip.path if lifts else _like_the_dlo(times, low, own, held)
     return _Hold(hand.name, grip.place, path, grip.turns, closes, opens, lifts)
 
 
@@ -424,11 +426,21 @@ def _grip(seen: Sightings, hand: HandSightings, turns: Floats, initial: Chain, t
 
 
 def _own(seen: Sightings, place: float) -> Floats:
-    """Return where a place of the DLO was seen, (n, 3) [m]; NaN where too little of the DLO was."""
+    """
+    Return where a place of the DLO was seen, (n, 3) [m].
+
+    It is NaN where too little of the DLO was seen, or nothing near the place on one side of it: beyond what
+    is seen, the DLO can lie anywhere.
+    """
     own = np.full((len(seen.times), 3), np.nan)
+    count = seen.points.shape[1]
+    at = place * (count - 1)
+    near = max(round(BRIDGED * count), 1)
+    before = slice(max(int(at) - near, 0), int(at) + 1)
+    after = slice(int(np.ceil(at)), int(np.ceil(at)) + near + 1)
     for k, points in enumerate(seen.points):
         chain = _complete(points)
-        if chain is not None:
+        if chain is not None and all(np.isfinite(points[side, 0]).any() for side in (before, after)):
             own[k] = _at(chain, np.array([place]))[0]
     return own
 
@@ -440,26 +452,29 @@ def _dragged(seen: Sightings, path: Floats) -> Floats:
     return np.asarray(seen.cameras + share * (path - seen.cameras))
 
 
-def _like_the_dlo(times: Floats, path: Floats, own: Floats) -> Floats:
+def _like_the_dlo(times: Floats, path: Floats, own: Floats, held: slice) -> Floats:
     """
     Return the smooth path (n, 3) [m] of a grip on the table as the DLO itself shows it.
 
-    That is better than a tag beside it; where the DLO is lost, the tag shows how it moves on.  A hand does not
-    tremble as the noise of single pictures does, which would shake a simulated DLO.
+    That is better than a tag beside it; where the DLO is lost, the tag shows how it moves on.  A hand does
+    not tremble as the noise of single pictures does, which would shake a simulated DLO.
 
-    :param path: as the tag shows it, and `own` as the DLO does.
+    :param path: as the tag shows it, and `own` as the DLO does; `held`: in which pictures the hand holds it.
     """
     moves = np.where(np.isfinite(path), path, 0.0)
-    both = np.flatnonzero(np.isfinite(own[:, 0]) & np.isfinite(path[:, 0]))
+    both = held.start + np.flatnonzero(np.isfinite(own[held, 0]) & np.isfinite(path[held, 0]))
+    if not len(both):
+        return path
     off = (own - moves)[both]
     smooth = np.full_like(path, np.nan)
     for k in np.flatnonzero(np.isfinite(path[:, 0])):
         near = np.maximum(np.exp(-np.square((times[both] - times[k]) / SPAN) / 2.0), 1e-9)
         smooth[k] = path[k] + near @ off / near.sum()
-    return np.where(np.isfinite(smooth), smooth, own)
+    return np.asarray(np.where(np.isfinite(smooth), smooth, own))
 
 
-def _opens(times: Floats, apart: Floats, most: float, speed: Floats, closes: int, last: int) -> int:
+def _opens(times: Floats, apart: Floats, most: float, speed: Floats, way: Floats, closes: int,
+           last: int) -> int:
     """
     Return the picture in which a hand opens: the last one before hand and DLO part.
 
@@ -468,13 +483,22 @@ def _opens(times: Floats, apart: Floats, most: float, speed: Floats, closes: int
 
     :param apart: (n,) how far both are apart [m]; NaN where this is unknown.
     :param most: how far they are apart while the hand holds the DLO [m].
+    :param way: (n,) of the hand from where it closed [m].
     """
     end = int(np.searchsorted(times, times[last] + 1.0))
     known = closes + np.flatnonzero(np.isfinite(apart[closes:end]))
     together = known[apart[known] < most]
     parts = [k for k in together if (apart[known[known > k][:PARTED]] >= most).all()]
-    if parts and (known > parts[0]).sum() >= PARTED:
-        held = parts[0]
+    parted = bool(parts) and bool((known > parts[0]).sum() >= PARTED)
+    held = parts[0] if parted else together[-1] if len(together) else closes
+    unseen = np.arange(held + 1, known[known > held][0] if (known > held).any() else end)
+    moves = closes + np.flatnonzero(speed[closes:end] >= STILL)
+    stood = unseen[(speed[unseen] < STILL) & (way[unseen] > WAY)]
+    if len(stood):  # they part while this is not seen, after the hand has come to a standstill
+        return int(np.split(stood, np.flatnonzero(np.diff(stood) > 1) + 1)[0][0])
+    if len(unseen) and times[unseen[-1]] - times[held] > LEAVING:
+        return int(np.clip(last, held, unseen[-1]))
+    if parted:
         for before in together[together < held][::-1]:  # they begin to part
             if not apart[held] > max(apart[before] + most / 4, most / 2):
                 break
@@ -482,9 +506,8 @@ def _opens(times: Floats, apart: Floats, most: float, speed: Floats, closes: int
         stood = together[(speed[together] < STILL) & (times[together] > times[held] - LEAVING)
                          & (together <= held)]
         return int(stood[-1] if len(stood) else held)
-    held = together[-1] if len(together) else closes
-    moves = np.flatnonzero(speed[closes:held + 1] >= STILL)
-    stands = min(closes + int(moves[-1]) + 1 if len(moves) else held, held)
+    moves = moves[moves <= held]
+    stands = min(int(moves[-1]) + 1 if len(moves) else held, held)
     return int(max(stands, min(last, held)))
 
 
