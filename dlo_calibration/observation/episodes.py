@@ -16,7 +16,6 @@ from typing import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.action import Hand, NO_ROTATION
@@ -348,7 +347,7 @@ def _hold(seen: Sightings, hand: HandSightings, initial: Chain, motion: Floats, 
 
 
 @dataclass(frozen=True, eq=False)
-class _Grip:
+class _Held:
     """
     How a hand may hold the DLO.
 
@@ -372,6 +371,8 @@ def _about_vertical(orientations: Floats, start: int) -> Floats:
     A small tag that the camera sees from straight ahead looks the same while it tilts a little; how it turns
     about the line of sight is seen well.
     """
+    from scipy.spatial.transform import Rotation  # takes a quarter of a second to load
+
     turned = np.full_like(orientations, np.nan)
     known = np.isfinite(orientations[:, 0])
     first = Rotation.from_quat(orientations[start])
@@ -382,13 +383,15 @@ def _about_vertical(orientations: Floats, start: int) -> Floats:
 
 
 def _grip(seen: Sightings, hand: HandSightings, turns: Floats, initial: Chain, there: NDArray[np.intp],
-          compared: NDArray[np.intp]) -> _Grip:
+          compared: NDArray[np.intp]) -> _Held:
     """
     Return the place of the DLO, and its offset from the tag, that move together best.
 
     :param turns: (n, 4) quaternions of the hand.
     :param there: pictures in which the hand is at the resting DLO; `compared`: those of the movement.
     """
+    from scipy.spatial.transform import Rotation  # takes a quarter of a second to load
+
     places = np.linspace(0.0, 1.0, PLACES)
     chains = {int(k): chain for k in compared if (chain := _complete(seen.points[k])) is not None}
     resting = initial.resample(places * initial.length)
@@ -421,7 +424,7 @@ def _grip(seen: Sightings, hand: HandSightings, turns: Floats, initial: Chain, t
     path = np.full((len(turns), 3), np.nan)
     known = np.isfinite(turns[:, 0]) & np.isfinite(hand.positions[:, 0])
     path[known] = hand.positions[known] + Rotation.from_quat(turns[known]).apply(offsets[best])
-    return _Grip(float(places[best]), float(np.median(apart[:, best])),
+    return _Held(float(places[best]), float(np.median(apart[:, best])),
                  float(np.sqrt(np.mean(np.square(trusted)))), float(cost[best]), path, turns)
 
 
