@@ -28,6 +28,7 @@ HERE = Path(__file__).resolve().parent
 COMMAND = [sys.executable, '-m', 'dlo_calibration']
 MOCAP_FIT = '0,8,16,24,32,40,48,54'  # spread over the session, because the choice matters
 MOCAP_OTHER = '42,43,44,45,46,47,49,50,51,52,53,55'
+MOCAP_ALL = ','.join(str(index) for index in range(56) if str(index) not in MOCAP_FIT.split(','))
 WIRE = 1.5  # m
 ENVIRONMENT = {**os.environ, 'PYTHONPATH': str(HERE.parent)}
 
@@ -105,15 +106,16 @@ def reference(folder: Path, options: list[str]) -> str:
 
 
 def mocap(folder: Path, options: list[str]) -> str:
-    """Tabulate three cables: fitted on 8 recordings, judged on 12 others."""
+    """Tabulate three cables: fitted on 8 recordings, judged on 12 others and on all 48 others."""
     parts = []
     for cable in ('dlo1', 'dlo2', 'dlo3'):
         session = convert('mocap', cable, folder / cable, '--recordings', MOCAP_FIT)
         fitted = fit(session, folder / f'{cable}_fit', *options)
-        unseen = convert('mocap', cable, folder / f'{cable}_other', '--recordings', MOCAP_OTHER)
-        other = validate(folder / f'{cable}_fit', unseen)
-        medians = [median(folder / f'{cable}_fit', chosen) for chosen in (session, unseen)]
-        parts.append(f'## {cable}\n\n{table("recordings", fitted, other, medians)}')
+        judged = {'fitted': (session, fitted)}
+        for name, chosen in (('12 others', MOCAP_OTHER), ('all others', MOCAP_ALL)):
+            unseen = convert('mocap', cable, folder / f'{cable}_{name}', '--recordings', chosen)
+            judged[name] = unseen, validate(folder / f'{cable}_fit', unseen)
+        parts.append(f'## {cable}\n\n{table("recordings", folder / f"{cable}_fit", judged)}')
     return '\n\n'.join(parts)
 
 
@@ -125,7 +127,7 @@ def hanging(folder: Path, options: list[str]) -> str:
         last = convert('hanging', wire, folder / f'{wire}_other', '--repeats', '4')
         fitted = fit(session, folder / f'{wire}_fit', *options)
         other = validate(folder / f'{wire}_fit', last)
-        medians = [median(folder / f'{wire}_fit', chosen) for chosen in (session, last)]
+        judged = {'fitted': (session, fitted), 'other': (last, other)}
         percents = [100 * document['rms_error_m'] / WIRE for document in (fitted, other)]
         stiffness = []
         for repeat in '01234':
@@ -134,7 +136,7 @@ def hanging(folder: Path, options: list[str]) -> str:
             stiffness.append(single['parameters']['flexibility']['physical_value'])
         spread = 100 * float(np.std(stiffness) / np.mean(stiffness))
         sections.append(
-            f'## {wire}\n\n{table("repeats", fitted, other, medians)}\n\n'
+            f'## {wire}\n\n{table("repeats", folder / f"{wire}_fit", judged)}\n\n'
             f'Root mean square in percent of the length, fitted and predicted: {percents[0]:.2f} and '
             f'{percents[1]:.2f}. EI of each repeat by itself: '
             + ', '.join(f'{value:.3g}' for value in stiffness)
@@ -142,15 +144,21 @@ def hanging(folder: Path, options: list[str]) -> str:
     return '\n\n'.join(sections)
 
 
-def table(what: str, fitted: dict[str, Any], other: dict[str, Any], medians: list[float]) -> str:
-    """Tabulate a fit and its validation; `medians` [m] are those of `median`."""
+def table(what: str, result: Path, judged: dict[str, tuple[Path, dict[str, Any]]]) -> str:
+    """
+    Tabulate how a fit does on several sets of trials.
+
+    :param result: the folder of the fit.
+    :param judged: name of each set -> its session, and what `fit` or `validate` said; the fitted one first.
+    """
     rows = [f'| {what} | trials | mean_abs_error_m | its median over {what} | mean_error_m | rms_error_m '
             '| max_error_m | error_percent_of_length | seconds |', '|' + '---|' * 9]
-    for name, document, middle in zip(('fitted', 'other'), (fitted, other), medians, strict=True):
-        errors = [document['mean_abs_error_m'], middle,
+    for name, (session, document) in judged.items():
+        errors = [document['mean_abs_error_m'], median(result, session),
                   *(document[key] for key in ('mean_error_m', 'rms_error_m', 'max_error_m'))]
         rows.append(f'| {name} | {document["trials"]} | ' + ' | '.join(f'{error:.5f}' for error in errors)
                     + f' | {document["error_percent_of_length"]:.3f} | {document["seconds"]:.0f} |')
+    fitted = next(iter(judged.values()))[1]
     rows.append('')
     for name, parameter in fitted['parameters'].items():
         rows.append(f'- {name} {estimate(fitted, name)}: {parameter["physical_value"]:.3g} '

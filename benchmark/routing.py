@@ -39,6 +39,7 @@ from dlo_calibration.planning.options import PlanOptions
 from dlo_calibration.planning.planner import plan
 from dlo_calibration.planning.rehearsal import ActionStep, motion_of_actions, RehearsalJob, rehearse
 from dlo_calibration.planning.surroundings import passed_wrongly, Surroundings
+from dlo_calibration.planning.ways import way_around
 from dlo_calibration.simulation.protocol import Simulator
 
 PEGS = (2, 3, 4)
@@ -171,7 +172,7 @@ def dragged(dlo: KnownDlo, points: Floats, grip: int, places: Floats, surroundin
 
     :param places: (w, 2) [m] that the hand passes at the sides of pegs at which a short way does.
     """
-    way = surroundings.way(places, dlo.radius)
+    way = way_around(surroundings, places, dlo.radius)
     if way is None:
         return None
     path = np.column_stack([way, np.full(len(way), points[grip, 2])])

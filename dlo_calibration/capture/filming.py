@@ -79,14 +79,17 @@ class Filming:
 
         :raises InputError: where the scale is unknown.
         """
-        if not self._views or any(view.scale is None for view in self._views):
+        if all(view.scale is None for view in self._views):
             raise InputError('film', 'no scale', 'the printed board on the table, or known points',
                              'lay the board beside the DLO and give --board, or give --scale')
         radius = self.radius
         if self._points and len(self._points) == len(self._views):
             return Sightings(np.array(self.times), np.stack(self._points), None, radius)
         points = np.stack([view.points(radius) for view in self._views])
-        cameras = np.stack([view.scale.camera for view in self._views if view.scale is not None])
+        # Where the view of the table is unknown, nothing was seen of the DLO.
+        scales = [view.scale for view in self._views]
+        known = next(scale for scale in scales if scale is not None)
+        cameras = np.stack([(known := scale or known).camera for scale in scales])
         return Sightings(np.array(self.times), points, cameras, radius)
 
     def hands(self, seen: Sightings) -> tuple[HandSightings, ...]:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_calibration.errors import InputError
-from dlo_calibration.model.action import Hand, NO_ROTATION, rotation_matrix
+from dlo_calibration.model.action import Hand, NO_ROTATION
 from dlo_calibration.model.chain import Chain, Floats, frozen_array, interpolate_unseen
 
 SPAN = 0.1  # s to either side over which a motion is measured
@@ -29,7 +29,15 @@ SHARE = 8  # of a DLO's points that are taken together when its motion is measur
 STILL = 0.015  # m/s; a hand that moves slower stands still
 REST = 0.5  # s; a shorter rest is a pause of the same movement
 WAY = 0.012  # m; the shortest way of a hand that moves a DLO
-PLACES = 101  # along the DLO at which a hand may hold it
+PLACES = 201  # along the DLO at which a hand may hold it
+MOST, ROUNDS = 60, 4  # pictures in which they are compared, and weightings of these
+DOUBTED = 0.006  # m; a picture in which a place is farther from where it is in the hand hardly counts
+BRIDGED = 0.2  # share of the length to both sides of a place, in which the DLO must be seen
+HIDDEN = 0.05  # share of the length to both sides of a grip that fingers hide
+LEAVING = 0.6  # s; a hand that leaves a DLO stood still so long before they are apart, at most
+PARTED = 5  # pictures in a row that show hand and DLO apart
+SLIPPED = 0.0015  # m, by which a held point moves beside its hand when that opens
+LEFT, SIGMAS = 0.005, 5.0  # m, and times what is typical: a grip farther from its hand is left
 HELD = 0.012  # m; from a hand to the point that it holds, at most, over most of the movement
 BESIDE = 0.005  # of a grip's distance from its tag that counts as error: of places alike, the nearest is held
 TRUSTED = 0.9  # of the pictures of a movement; in the others, the tracker may be wrong
@@ -109,15 +117,22 @@ class Episode:
     moving: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Hold:
-    """A hand that holds the DLO, from one picture to another; `offset` leads from its tag to the grip."""
+    """
+    A hand that holds the DLO, from one picture to another.
 
-    hand: HandSightings
+    :param grips: (n, 3) where it holds the DLO [m], in all pictures, and `turns`, (n, 4); NaN where unknown.
+    :param lifts: whether it lifts the DLO from the table.
+    """
+
+    name: str
     place: float
-    offset: Floats
+    grips: Floats
+    turns: Floats
     first: int
     last: int
+    lifts: bool
 
 
 def episodes(seen: Sightings, hands: Sequence[HandSightings],
@@ -285,134 +300,280 @@ def _hold(seen: Sightings, hand: HandSightings, initial: Chain, motion: Floats, 
           last: int) -> _Hold | None:
     """Return how a hand holds the DLO in a movement, from picture `first` to `last`; None: it does not."""
     times = seen.times
+    still_turned = np.tile(NO_ROTATION, (len(times), 1))
     if hand.place is not None:
-        return _Hold(hand, hand.place, np.zeros(3), max(first - 1, 0), last)
+        high = np.nanmax(hand.positions[first:last + 1, 2], initial=-np.inf) - seen.radius
+        return _Hold(hand.name, hand.place, hand.positions, still_turned, max(first - 1, 0), last,
+                     bool(high > LIFTED))
     known = np.isfinite(hand.positions[:, 0])
     speed = _speed(times, hand.positions)
-    near = _between(times, times[first] - 3 * SPAN, times[first] + 1.5 * SPAN)
+    near = _between(times, times[first] - 3 * SPAN, times[first] + 5 * SPAN)
     near = near[known[near]]
     span = np.arange(first, last + 1)
     span = span[known[span]]
     if not len(near) or len(span) < 3:
         return None
+    # It has come to a standstill before it moves again, with the DLO.
     still = near[speed[near] < STILL]
-    closes = int(still[-1]) if len(still) else int(near[speed[near].argmin()])
+    stands = np.split(still, np.flatnonzero(np.diff(still) > 1) + 1)[0]
+    closes = int(stands[-1]) if len(still) else int(near[speed[near].argmin()])
     if np.linalg.norm(hand.positions[span] - hand.positions[closes], axis=1).max() < WAY:
         return None
-    turns = _rotations(hand)
-    places = np.linspace(0.0, 1.0, PLACES)
-    held = initial.resample(places * initial.length)
     there = near[near <= closes]
     there = there[np.linalg.norm(hand.positions[there] - hand.positions[closes], axis=1) < AT_REST]
-    offsets = np.mean([(held - hand.positions[k]) @ turns[k] for k in there], axis=0)  # (PLACES, 3)
-    compared = span[np.unique(np.linspace(0, len(span) - 1, min(len(span), 60)).astype(int))]
-    away = np.full((len(compared), PLACES), np.nan)
-    for row, k in enumerate(compared):
-        chain = _complete(seen.points[k])
-        if chain is not None:
-            away[row] = _apart(seen, k, hand.positions[k] + offsets @ turns[k].T, _at(chain, places))
-    if not np.isfinite(away).any():
+    compared = span[np.unique(np.linspace(0, len(span) - 1, min(len(span), MOST)).astype(int))]
+    turned = [still_turned] if hand.orientations is None else [
+        hand.orientations, _about_vertical(hand.orientations, closes)]
+    grip = min((_grip(seen, hand, rotations, initial, there, compared) for rotations in turned),
+               key=lambda grip: grip.cost)
+    if not grip.mean < HELD:
         return None
-    away = np.sort(away[np.isfinite(away[:, 0])], axis=0)
-    typical = np.sqrt(np.mean(away[:max(round(TRUSTED * len(away)), 1)]**2, axis=0))
+    own = _own(seen, grip.place)
+    apart = np.full(len(times), np.nan)
+    both = np.isfinite(own[:, 0]) & known
+    apart[both] = _apart(seen, grip.path[both], own[both], both)
+    way = np.linalg.norm(hand.positions - hand.positions[closes], axis=1)
+    opens = _opens(times, apart, min(max(LEFT, SIGMAS * grip.typical), HELD), speed, way, closes, last)
+    stands = closes + np.flatnonzero(
+        np.linalg.norm(grip.path[closes:opens + 1] - grip.path[opens], axis=1) < LEFT)
+    low = grip.path if seen.cameras is None else _dragged(seen, grip.path)
+    opens = _slips(low - own, closes, opens, stands)
+    held = slice(closes, opens + 1)
+    moving = grip.path[held][(speed[held] >= STILL) & known[held]]
+    lifts = seen.cameras is None or not len(moving) or bool(
+        np.median(moving[:, 2]) - seen.radius > LIFTED)
+    path = grip.path if lifts else _like_the_dlo(times, low, own, held)
+    return _Hold(hand.name, grip.place, path, grip.turns, closes, opens, lifts)
+
+
+@dataclass(frozen=True, eq=False)
+class _Held:
+    """
+    How a hand may hold the DLO.
+
+    :param typical: distance between the place and where it is in the hand [m], the median; `mean`: the root
+        mean square of the trusted ones; `cost` counts the offset, too.
+    :param path: (n, 3) where the grip is, as the tag shows it [m], and `turns`, (n, 4); NaN where unknown.
+    """
+
+    place: float
+    typical: float
+    mean: float
+    cost: float
+    path: Floats
+    turns: Floats
+
+
+def _about_vertical(orientations: Floats, start: int) -> Floats:
+    """
+    Return the part of the turning that is about the vertical, (n, 4), since a picture.
+
+    A small tag that the camera sees from straight ahead looks the same while it tilts a little; how it turns
+    about the line of sight is seen well.
+    """
+    from scipy.spatial.transform import Rotation  # takes a quarter of a second to load
+
+    turned = np.full_like(orientations, np.nan)
+    known = np.isfinite(orientations[:, 0])
+    first = Rotation.from_quat(orientations[start])
+    since = (Rotation.from_quat(orientations[known]) * first.inv()).as_matrix()
+    angle = np.arctan2(since[:, 1, 0] - since[:, 0, 1], since[:, 0, 0] + since[:, 1, 1])
+    turned[known] = (Rotation.from_rotvec(angle[:, None] * [0.0, 0.0, 1.0]) * first).as_quat()
+    return turned
+
+
+def _grip(seen: Sightings, hand: HandSightings, turns: Floats, initial: Chain, there: NDArray[np.intp],
+          compared: NDArray[np.intp]) -> _Held:
+    """
+    Return the place of the DLO, and its offset from the tag, that move together best.
+
+    :param turns: (n, 4) quaternions of the hand.
+    :param there: pictures in which the hand is at the resting DLO; `compared`: those of the movement.
+    """
+    from scipy.spatial.transform import Rotation  # takes a quarter of a second to load
+
+    places = np.linspace(0.0, 1.0, PLACES)
+    chains = {int(k): chain for k in compared if (chain := _complete(seen.points[k])) is not None}
+    resting = initial.resample(places * initial.length)
+    pictures = np.array([*there, *chains], int)
+    points = np.stack([*[resting] * len(there), *(_at(chain, places) for chain in chains.values())])
+    # Across the line of sight: one camera does not show more, but a DLO at rest lies on the table.
+    across = np.tile(np.eye(3), (*points.shape[:2], 1, 1))
+    if seen.cameras is not None:
+        rays = points - seen.cameras[pictures, None]
+        rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+        across[len(there):] -= (rays[..., :, None] * rays[..., None, :])[len(there):]
+    rotations = Rotation.from_quat(turns[pictures]).as_matrix()
+    tags = hand.positions[pictures, None]
+    slopes = across @ rotations[:, None]  # (k, PLACES, 3, 3)
+    values = (across @ (points - tags)[..., None])[..., 0]
+    offsets = np.einsum('kba,kpb->pa', rotations[:len(there)], resting - tags[:len(there)]) / len(there)
+    for _ in range(ROUNDS):
+        apart = np.linalg.norm(np.einsum('kpab,pb->kpa', slopes, offsets) - values, axis=2)
+        weights = 1.0 / np.square(1.0 + np.square(apart / DOUBTED))  # Geman and McClure's
+        normal = np.einsum('kp,kpab,kpac->pbc', weights, slopes, slopes)
+        normal += BESIDE**2 * len(pictures) * np.eye(3)
+        right = np.einsum('kp,kpab,kpa->pb', weights, slopes, values)
+        offsets = np.linalg.solve(normal, right[..., None])[..., 0]
+    apart = np.linalg.norm(np.einsum('kpab,pb->kpa', slopes, offsets) - values, axis=2)
+    mean = np.sqrt(np.mean(np.square(apart) / (1.0 + np.square(apart / DOUBTED)), axis=0))
     reach = np.linalg.norm(offsets, axis=1)
-    cost = np.hypot(typical, BESIDE * reach)
-    cost[reach > REACH] = np.inf
+    cost = np.where(reach > REACH, np.inf, np.hypot(mean, BESIDE * reach))
     best = int(cost.argmin())
-    if not typical[best] < HELD:
-        return None
-    return _Hold(hand, float(places[best]), offsets[best], closes,
-                 _opens(seen, hand, turns, offsets[best], float(places[best]), motion, speed, closes, last))
+    trusted = np.sort(apart[:, best])[:max(round(TRUSTED * len(apart)), 1)]
+    path = np.full((len(turns), 3), np.nan)
+    known = np.isfinite(turns[:, 0]) & np.isfinite(hand.positions[:, 0])
+    path[known] = hand.positions[known] + Rotation.from_quat(turns[known]).apply(offsets[best])
+    return _Held(float(places[best]), float(np.median(apart[:, best])),
+                 float(np.sqrt(np.mean(np.square(trusted)))), float(cost[best]), path, turns)
 
 
-def _opens(seen: Sightings, hand: HandSightings, turns: Floats, offset: Floats, place: float, motion: Floats,
-           speed: Floats, closes: int, last: int) -> int:
+def _own(seen: Sightings, place: float) -> Floats:
     """
-    Return the picture in which a hand opens.
+    Return where a place of the DLO was seen, (n, 3) [m].
 
-    That is when the DLO begins to move alone, or when the hand leaves it, or, where neither is seen, when the
-    hand has come to a standstill.
+    It is NaN where too little of the DLO was seen, or nothing near the place on one side of it: beyond what
+    is seen, the DLO can lie anywhere.
     """
-    times = seen.times
+    own = np.full((len(seen.times), 3), np.nan)
+    count = seen.points.shape[1]
+    at = place * (count - 1)
+    near = max(round(BRIDGED * count), 1)
+    before = slice(max(int(at) - near, 0), int(at) + 1)
+    after = slice(int(np.ceil(at)), int(np.ceil(at)) + near + 1)
+    for k, points in enumerate(seen.points):
+        chain = _complete(points)
+        if chain is not None and all(np.isfinite(points[side, 0]).any() for side in (before, after)):
+            own[k] = _at(chain, np.array([place]))[0]
+    return own
+
+
+def _dragged(seen: Sightings, path: Floats) -> Floats:
+    """Return the path (n, 3) [m] of a grip on the table, from how a tag shows it."""
+    assert seen.cameras is not None
+    share = (seen.radius - seen.cameras[:, 2:]) / (path[:, 2:] - seen.cameras[:, 2:])
+    return np.asarray(seen.cameras + share * (path - seen.cameras))
+
+
+def _like_the_dlo(times: Floats, path: Floats, own: Floats, held: slice) -> Floats:
+    """
+    Return the smooth path (n, 3) [m] of a grip on the table as the DLO itself shows it.
+
+    That is better than a tag beside it; where the DLO is lost, the tag shows how it moves on.  A hand does
+    not tremble as the noise of single pictures does, which would shake a simulated DLO.
+
+    :param path: as the tag shows it, and `own` as the DLO does; `held`: in which pictures the hand holds it.
+    """
+    moves = np.where(np.isfinite(path), path, 0.0)
+    both = held.start + np.flatnonzero(np.isfinite(own[held, 0]) & np.isfinite(path[held, 0]))
+    if not len(both):
+        return path
+    off = (own - moves)[both]
+    smooth = np.full_like(path, np.nan)
+    for k in np.flatnonzero(np.isfinite(path[:, 0])):
+        near = np.maximum(np.exp(-np.square((times[both] - times[k]) / SPAN) / 2.0), 1e-9)
+        smooth[k] = path[k] + near @ off / near.sum()
+    return np.asarray(np.where(np.isfinite(smooth), smooth, own))
+
+
+def _opens(times: Floats, apart: Floats, most: float, speed: Floats, way: Floats, closes: int,
+           last: int) -> int:
+    """
+    Return the picture in which a hand opens: the last one before hand and DLO part.
+
+    A hand that moves away has stood still before.  While both stay together, it opens when it has come to a
+    standstill: nothing shows that it holds the DLO any longer.
+
+    :param apart: (n,) how far both are apart [m]; NaN where this is unknown.
+    :param most: how far they are apart while the hand holds the DLO [m].
+    :param way: (n,) of the hand from where it closed [m].
+    """
     end = int(np.searchsorted(times, times[last] + 1.0))
-    held, away = closes, 0
-    for k in range(closes, min(end, len(times))):
-        chain = _complete(seen.points[k])
-        if chain is None or not np.isfinite(hand.positions[k]).all():
-            continue
-        grip = hand.positions[k] + turns[k] @ offset
-        if _apart(seen, k, grip, _at(chain, np.array([place])))[0] < 1.5 * HELD:
-            held, away = k, 0
-        else:
-            away += 1
-            if away > 5 and k > closes + 5:
+    known = closes + np.flatnonzero(np.isfinite(apart[closes:end]))
+    together = known[apart[known] < most]
+    parts = [k for k in together if (apart[known[known > k][:PARTED]] >= most).all()]
+    parted = bool(parts) and bool((known > parts[0]).sum() >= PARTED)
+    held = parts[0] if parted else together[-1] if len(together) else closes
+    unseen = np.arange(held + 1, known[known > held][0] if (known > held).any() else end)
+    moves = closes + np.flatnonzero(speed[closes:end] >= STILL)
+    stood = unseen[(speed[unseen] < STILL) & (way[unseen] > WAY)]
+    if len(stood):  # they part while this is not seen, after the hand has come to a standstill
+        return int(np.split(stood, np.flatnonzero(np.diff(stood) > 1) + 1)[0][0])
+    if len(unseen) and times[unseen[-1]] - times[held] > LEAVING:
+        return int(np.clip(last, held, unseen[-1]))
+    if parted:
+        for before in together[together < held][::-1]:  # they begin to part
+            if not apart[held] > max(apart[before] + most / 4, most / 2):
                 break
-    still = np.flatnonzero(speed[closes:held + 1] >= STILL)
-    stands = closes + int(still[-1]) + 1 if len(still) else held
-    stands = min(stands, held)
-    if last <= stands:
-        return min(max(last, closes + 1), held) if held > closes else held
-    quiet = np.flatnonzero(motion[stands:last + 1] < MOVES)
-    falls = len(quiet) and motion[stands + quiet[0]:last + 1].max() > MOVES
-    if falls:  # it rested in the hand, and moves again without it
-        again = np.flatnonzero(motion[stands + quiet[0]:last + 1] > MOVES)[0]
-        return min(stands + int(quiet[0]) + int(again), held)
-    return stands
+            held = before
+        stood = together[(speed[together] < STILL) & (times[together] > times[held] - LEAVING)
+                         & (together <= held)]
+        return int(stood[-1] if len(stood) else held)
+    moves = moves[moves <= held]
+    stands = min(int(moves[-1]) + 1 if len(moves) else held, held)
+    return int(max(stands, min(last, held)))
 
 
-def _apart(seen: Sightings, k: int, grips: Floats, points: Floats) -> Floats:
-    """Return the distances (p,) [m] of grips (p, 3) from points (p, 3), or from their lines of sight."""
+def _slips(apart: Floats, closes: int, opens: int, stands: NDArray[np.intp]) -> int:
+    """
+    Return the picture in which a hand opens: the last one before the DLO begins to move without it.
+
+    :param apart: (n, 3) from the hand's grip to the place that it holds [m]; NaN where unknown.
+    :param stands: pictures in which the hand stands where it opens.
+    """
+    known = closes + np.flatnonzero(np.isfinite(apart[closes:opens + 1, 0]))
+    for k in range(PARTED, len(known)):
+        if known[k] not in stands:
+            continue
+        usual = np.median(apart[known[k - PARTED:k]], axis=0)
+        if (np.linalg.norm(apart[known[k:]] - usual, axis=1) > SLIPPED).all():
+            return int(known[k - 1])
+    return opens
+
+
+def _apart(seen: Sightings, grips: Floats, points: Floats, pictures: NDArray[np.bool_]) -> Floats:
+    """Return the distances (k,) [m] of grips (k, 3) from points (k, 3), or from their lines of sight."""
     between = grips - points
     if seen.cameras is not None:
-        ray = points - seen.cameras[k]
+        ray = points - seen.cameras[pictures]
         ray = ray / np.linalg.norm(ray, axis=1, keepdims=True)
         between = between - (between * ray).sum(axis=1, keepdims=True) * ray
     return np.asarray(np.linalg.norm(between, axis=1))
 
 
 def _speed(times: Floats, positions: Floats) -> Floats:
-    """Return speeds (n,) [m/s]; infinite where they are unknown."""
-    early = np.maximum(np.arange(len(times)) - 1, 0)
-    late = np.minimum(np.arange(len(times)) + 1, len(times) - 1)
-    lapse = np.maximum(times[late] - times[early], 1e-9)
-    speed = np.linalg.norm(positions[late] - positions[early], axis=1) / lapse
-    return np.asarray(np.where(np.isfinite(speed), speed, np.inf))
-
-
-def _rotations(hand: HandSightings) -> Floats:
-    """Return the rotations (n, 3, 3) of a hand, the identity where they are unknown."""
-    turns = np.tile(np.eye(3), (len(hand.positions), 1, 1))
-    if hand.orientations is not None:
-        for k in np.flatnonzero(np.isfinite(hand.orientations).all(axis=1)):
-            turns[k] = rotation_matrix(hand.orientations[k])
-    return turns
-
-
-def _grip_path(hold: _Hold) -> Floats:
-    """Return where the grip of a hand is in each picture, (n, 3) [m]."""
-    return np.asarray(hold.hand.positions + _rotations(hold.hand) @ hold.offset)
+    """Return speeds (n,) [m/s], the slopes of straight lines over the span; infinite where unknown."""
+    speed = np.full(len(times), np.inf)
+    early = np.searchsorted(times, times - SPAN - 1e-9)
+    late = np.searchsorted(times, times + SPAN + 1e-9)
+    for k, (begin, end) in enumerate(zip(early, late, strict=True)):
+        since = times[begin:end] - times[begin:end].mean()
+        if since.any():
+            slope = np.linalg.norm(since @ positions[begin:end]) / np.square(since).sum()
+            speed[k] = slope if np.isfinite(slope) else np.inf
+    return speed
 
 
 def _path(seen: Sightings, hold: _Hold, initial: Chain) -> Hand:
     """Return the path of a hand while it holds the DLO."""
-    places = _grip_path(hold)
-    known = [k for k in range(hold.first, hold.last + 1) if np.isfinite(places[k]).all()]
+    known = [k for k in range(hold.first, hold.last + 1) if np.isfinite(hold.grips[k]).all()]
     if len(known) < 2:
-        raise InputError('hand', f'{hold.hand.name}, which is hardly seen while it holds the DLO',
+        raise InputError('hand', f'{hold.name}, which is hardly seen while it holds the DLO',
                          'a tag that the camera sees', 'glue it where the hand does not hide it')
-    if seen.cameras is not None and np.nanmax(places[known, 2]) - seen.radius < LIFTED:
-        # It drags the DLO over the table: where that meets the line of sight, the grip is known best.
-        cameras = seen.cameras[known]
-        share = (seen.radius - cameras[:, 2:]) / (places[known, 2:] - cameras[:, 2:])
-        places[known] = cameras + share * (places[known] - cameras)
     kept = [known[0]]
     for k in known[1:]:
         if seen.times[k] - seen.times[kept[-1]] >= PATH or k == known[-1]:
             kept.append(k)
     point, offset = initial.grip(hold.place * initial.length)
-    turns = np.tile(NO_ROTATION, (len(kept), 1)) if hold.hand.orientations is None else (
-        hold.hand.orientations[kept])
-    return Hand(hold.hand.name, (point,), seen.times[kept], places[kept], turns, offset, True)
+    return Hand(hold.name, (point,), seen.times[kept], hold.grips[kept], _without_gaps(hold.turns)[kept],
+                offset, True)
+
+
+def _without_gaps(turns: Floats) -> Floats:
+    """Return orientations (n, 4), those that are unknown as the nearest known ones."""
+    known = np.flatnonzero(np.isfinite(turns[:, 0]))
+    nearest = np.abs(np.arange(len(turns))[:, None] - known).argmin(axis=1)
+    return np.asarray(turns[known[nearest]])
 
 
 def without_lifted(points: Floats, tag: Floats, radius: float) -> Floats:
@@ -447,12 +608,17 @@ def _low(seen: Sightings, holds: Sequence[_Hold], k: int) -> Floats | None:
     points = np.array(seen.points[k])
     if seen.cameras is None:
         return points
+    whole = _complete(points)
     share = np.linspace(0.0, 1.0, len(points))
     length = float(np.nansum(np.linalg.norm(np.diff(points, axis=0), axis=1))) or 1.0
     diameter = max(2.0 * seen.radius, 1e-3)
     for hold in holds:
-        lifted = float(_grip_path(hold)[k, 2]) - seen.radius
-        if hold.first <= k <= hold.last and lifted > LIFTED:
+        lifted = float(hold.grips[k, 2]) - seen.radius
+        if hold.lifts and hold.first <= k <= hold.last and lifted > LIFTED:
             reach = max(BUMP * diameter * (lifted / diameter) ** 0.25, SLACK * lifted)
             points[np.abs(share - hold.place) * length <= reach] = np.nan
+        elif whole is not None and not hold.lifts and hold.first <= k <= hold.last:
+            # What the fingers hide is where the path of the hand has it.
+            near = np.abs(share - hold.place) <= HIDDEN
+            points[near] = whole[near]
     return points if _usable(points) else None

@@ -240,6 +240,11 @@ class _Grip:
         """Whether the views show if the DLO follows the hand."""
         return self.way > WAY and len(self.times) > LOST
 
+    @property
+    def visible(self) -> bool:
+        """Whether what it grips is seen: the DLO beside it turns about the hand, which looks late or off."""
+        return bool(np.isfinite(self.places[:, self.beside.argmin(), 0]).mean() >= 0.5)
+
     def apart(self, late: Floats) -> Floats:
         """
         Return how far each place is from where it was in the hand at first, (k, g, p) [m]; NaN: unknown.
@@ -305,7 +310,7 @@ class _Grip:
 
 def _delay(grips: Sequence[_Grip]) -> Estimate | None:
     """Return by how much the stamps of hands are late [s]; None: it is not seen."""
-    shown = [grip for grip in grips if grip.shown]
+    shown = [grip for grip in grips if grip.shown and grip.visible]
     if not shown:
         return None
 
@@ -342,7 +347,7 @@ def _shift(grips: Sequence[_Grip], delay: float) -> Estimate | None:
     for grip in pins:
         offsets.append(grip.places[0] - grip.hand.positions[0])  # (p, 3)
         cost = np.zeros(len(offsets[-1]))
-        if grip.shown:
+        if grip.shown and grip.visible:
             squares, views = grip.squares(np.array([delay]))
             cost = np.where(views[0] > 0, squares[0], 0.0) * views[0] / LOST / SCATTER**2
         costs.append(np.where(np.isfinite(offsets[-1][:, 0]), cost, np.inf))

@@ -17,6 +17,7 @@ from dlo_calibration.planning.limits import HANDS
 from dlo_calibration.planning.options import KINDS
 from dlo_calibration.planning.rehearsal import ActionStep
 from dlo_calibration.planning.surroundings import passed_wrongly, Surroundings
+from dlo_calibration.planning.ways import way_around
 
 LIFTING = KINDS[0]  # grasp_and_place; the other kind stays on the table
 MOST_GRIPS = 11  # places along the DLO where one hand may grip; neighbours do nearly the same
@@ -172,7 +173,7 @@ def _ways(kind: str, grip: int, points: Floats, way: Floats, over: Floats, hands
     """
     begin, ways = points[grip], [way]
     if surroundings.bodies:
-        around = surroundings.way(np.vstack([begin[:2], way]), float(begin[2]))
+        around = way_around(surroundings, np.vstack([begin[:2], way]), float(begin[2]))
         ways = [] if around is None else [around[1:]]
         if kind == LIFTING and (around is None or len(around) > 2):
             ways.append(over)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-import heapq
 from typing import Iterator, Self, Sequence
 
 import numpy as np
@@ -17,27 +16,23 @@ from dlo_calibration.errors import InputError
 from dlo_calibration.model.action import Action
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.simulation import core
-from dlo_calibration.simulation.scene import core_body, Obstacle
+from dlo_calibration.simulation.scene import core_body, extremes, Obstacle
 
 CORNERS = 12  # of the polygon that stands for a body, seen from above
 SPARE = 1e-3  # m that corners of ways are further away than the clearance
 STRIDE = 5e-4  # m; shortest step along a way whose clearance is checked
 SAME = 1e-6  # m; places that are nearer to each other are one
-PUSHES = 20  # at most, of a place out of bodies
-MOST_CORNERS = 300  # that a search for a way looks from, at most
-MOST_BODIES = 40  # that a way goes around, at most: the nearest ones
 UPRIGHT = 0.7  # least vertical part of the direction in which a body is left by what lies on it
 SUNK = 2e-3  # m that a point of the DLO may be lower, or inside a body: noise
-OPEN = 4  # corners of the rims of a cylinder for each of CORNERS
 
 
-def outline(obstacle: Obstacle, corners: int = OPEN * CORNERS, margin: float = 0.0) -> Floats:
+def outline(obstacle: Obstacle, corners: int, margin: float = 0.0) -> Floats:
     """
     Return the outline of an obstacle seen from above: corners of a convex polygon around it, (c, 2) [m].
 
     :param margin: by which the polygon is wider on all sides [m].
     """
-    points, radius = _extremes(obstacle)
+    points, radius = extremes(obstacle)
     angles = 2 * np.pi * np.arange(corners) / corners
     outwards = np.column_stack([np.cos(angles), np.sin(angles)])
     support = (points[:, :2] @ outwards.T).max(axis=0) + radius + margin
@@ -45,27 +40,6 @@ def outline(obstacle: Obstacle, corners: int = OPEN * CORNERS, margin: float = 0
     after, sine = np.roll(outwards, -1, axis=0), np.sin(2 * np.pi / corners)
     turned, turned_after = (np.column_stack([side[:, 1], -side[:, 0]]) for side in (outwards, after))
     return np.asarray((support[:, None] * turned_after - np.roll(support, -1)[:, None] * turned) / sine)
-
-
-def _extremes(obstacle: Obstacle) -> tuple[Floats, float]:
-    """Return points, (m, 3) [m], and a radius [m]; the hull of balls around these points is the obstacle."""
-    from scipy.spatial.transform import Rotation  # slow to load
-
-    sizes, radius = obstacle.sizes, 0.0
-    if obstacle.shape == 'box':
-        local = np.stack(np.meshgrid(*([-0.5, 0.5],) * 3), axis=-1).reshape(-1, 3) * sizes
-    elif obstacle.shape == 'sphere':
-        local, radius = np.zeros((1, 3)), float(sizes[0])
-    elif obstacle.shape == 'capsule':
-        local, radius = np.array([[0, 0, -0.5], [0, 0, 0.5]]) * sizes[0], float(sizes[1])
-    elif obstacle.shape == 'cylinder':
-        angles = 2 * np.pi * np.arange(OPEN * CORNERS) / (OPEN * CORNERS)
-        circle = np.column_stack([np.cos(angles), np.sin(angles)]) * sizes[1]
-        local = np.vstack([np.column_stack([circle, np.full(len(circle), z)])
-                           for z in (-sizes[0] / 2, sizes[0] / 2)])
-    else:
-        local = obstacle.triangles.reshape(-1, 3) * sizes
-    return Rotation.from_quat(obstacle.turn).apply(local) + obstacle.position, radius
 
 
 @dataclass(frozen=True)
@@ -94,8 +68,8 @@ class Standing:
 
         :param points: (m, 3) [m] where the DLO lies.
         """
-        extremes, radius = _extremes(obstacle)
-        lower, upper = extremes.min(axis=0) - radius, extremes.max(axis=0) + radius
+        corners, radius = extremes(obstacle)
+        lower, upper = corners.min(axis=0) - radius, corners.max(axis=0) + radius
         try:
             body = core_body(obstacle)
         except InputError:
@@ -152,14 +126,14 @@ class Surroundings:
         return cls(tuple(Standing.of(obstacle, clearance, points) for obstacle in obstacles))
 
     @cached_property
-    def _margins(self) -> Floats:
+    def margins(self) -> Floats:
         """Lowest and highest corners of the boxes that enclose bodies and their clearance, (2, b, 3) [m]."""
         return np.array([[body.lower - body.clearance for body in self.bodies],
                          [body.upper + body.clearance for body in self.bodies]]).reshape(2, -1, 3)
 
     def _near(self, begin: Floats, end: Floats) -> Iterator[tuple[int, Standing]]:
         """Yield the number of a straight way, and a body to which it comes nearer than the clearance."""
-        lower, upper = self._margins
+        lower, upper = self.margins
         # Boxes around way and body that do not overlap are far from each other.
         overlap = ((np.minimum(begin, end)[:, None] <= upper) & (np.maximum(begin, end)[:, None] >= lower))
         for way, body in np.argwhere(overlap.all(axis=2)):
@@ -168,7 +142,7 @@ class Surroundings:
 
     def spare(self, place: Floats) -> float:
         """Return by how much a place, (3,) [m], keeps more than the clearance of all bodies [m]."""
-        lower, upper = self._margins
+        lower, upper = self.margins
         least = np.linalg.norm(np.maximum(np.maximum(lower - place, place - upper), 0.0), axis=1)
         spare = np.inf
         for k in np.argsort(least, kind='stable'):
@@ -208,94 +182,11 @@ class Surroundings:
         :param way: (w, 2) [m] places that it passes straight.
         """
         while True:
-            places = _raised(way, height)
+            places = raised(way, height)
             tops = [float(body.upper[2]) + body.clearance for _, body in self._near(places[:-1], places[1:])]
             if not tops:
                 return height
             height = max(tops) + SPARE
-
-    def way(self, places: Floats, height: float) -> Floats | None:
-        """
-        Return a short way that keeps the clearance, and passes bodies at the same side as the given one.
-
-        :param places: (w, 2) [m] that the given way passes; all but the first are moved out of bodies.
-        :param height: of the way [m].
-        :returns: (v, 2) [m], from the first place to the last one; None if there is none.
-        """
-        pushed = [self._pushed(place, height) for place in places[1:]]
-        if pushed[-1] is None:
-            return None
-        way = [places[0]]
-        for place in pushed:
-            if place is not None:
-                part = self._around(way[-1], place, height)
-                if part is None:
-                    return None
-                way += part
-        return self._shortened(np.array(way), height)
-
-    def _pushed(self, place: Floats, height: float) -> Floats | None:
-        """Return the place, (2,) [m], moved out of the clearance of bodies; None if that does not succeed."""
-        place = np.array(place, float)
-        for _ in range(PUSHES):
-            lack = SPARE - self.spare(np.append(place, height))
-            if lack <= SPARE / 2:
-                return place
-            uphill = np.array([self.spare(np.append(place + step, height))
-                               - self.spare(np.append(place - step, height))
-                               for step in np.eye(2) * STRIDE]) / (2 * STRIDE)
-            slope = float(np.linalg.norm(uphill))
-            if slope < 0.1:  # as above the middle of a body
-                return None
-            place = place + lack * uphill / slope
-        return None
-
-    def _around(self, begin: Floats, end: Floats, height: float) -> list[Floats] | None:
-        """Return the places that the shortest way from begin to end, both (2,) [m], passes after begin."""
-        if self.clear(_raised(begin[None], height), _raised(end[None], height))[0]:
-            return [end]
-        low, high = self._margins[..., 2]
-        around = [self.bodies[k] for k in np.flatnonzero((low < height) & (height < high))]
-        around.sort(key=lambda body: float(np.linalg.norm(2 * body.middle - begin - end)))
-        corners = np.concatenate([[end], *(body.corners for body in around[:MOST_BODIES])])
-        # A* (Hart, Nilsson and Raphael 1968) on the visibility graph of the corners, whose edges are checked
-        # only where the search comes.
-        far = np.linalg.norm(corners - end, axis=1)
-        raised, costs = _raised(corners, height), np.full(len(corners), np.inf)
-        before, done = np.full(len(corners), -1), np.zeros(len(corners), bool)
-        queue: list[tuple[float, int]] = [(0.0, -1)]
-        for _ in range(MOST_CORNERS):
-            if not queue:
-                return None
-            at = heapq.heappop(queue)[1]
-            if at == 0:
-                return _traced(corners, before)
-            if at > 0 and done[at]:
-                continue
-            here, spent = (begin, 0.0) if at < 0 else (corners[at], costs[at])
-            if at >= 0:
-                done[at] = True
-            reached = spent + np.linalg.norm(corners - here, axis=1)
-            tried = np.flatnonzero(~done & (reached < costs - SAME))
-            origin = np.repeat(_raised(here[None], height), len(tried), axis=0)
-            for k in tried[self.clear(origin, raised[tried])]:
-                costs[k], before[k] = reached[k], at
-                heapq.heappush(queue, (float(reached[k] + far[k]), int(k)))
-        return None
-
-    def _shortened(self, way: Floats, height: float) -> Floats:
-        """Return a way without places where no body stands between it and the shortcut."""
-        middles = np.array([body.middle for body in self.bodies]).reshape(-1, 2)
-        places, k = list(way), 1
-        while k < len(places) - 1:
-            corner = np.array(places[k - 1:k + 2])
-            line = _raised(corner[[0, 2]], height)
-            if not _inside(middles, corner).any() and self.clear(line[:1], line[1:])[0]:
-                del places[k]
-                k = max(k - 1, 1)
-            else:
-                k += 1
-        return np.array(places)
 
     def top(self, posts: Floats) -> float:
         """Return the height of the highest of `posts` [m]."""
@@ -332,22 +223,6 @@ def passed_wrongly(points: Floats, goal: Floats, posts: Floats) -> int:
     return int(np.abs(turns.round()).sum())
 
 
-def _raised(places: Floats, height: float) -> Floats:
+def raised(places: Floats, height: float) -> Floats:
+    """Return places, (m, 2) [m], at a height [m]: (m, 3)."""
     return np.column_stack([places, np.full(len(places), height)])
-
-
-def _traced(corners: Floats, before: NDArray[np.int64]) -> list[Floats]:
-    """Return the places from the first after the begin to the end, which is corner 0."""
-    at, places = 0, []
-    while at >= 0:
-        places.append(corners[at])
-        at = int(before[at])
-    return places[::-1]
-
-
-def _inside(places: Floats, triangle: Floats) -> NDArray[np.bool_]:
-    """Tell which places, (p, 2) [m], lie inside a triangle with (3, 2) [m] corners."""
-    sides = np.roll(triangle, -1, axis=0) - triangle
-    away = places[:, None] - triangle
-    cross = sides[:, 0] * away[..., 1] - sides[:, 1] * away[..., 0]
-    return np.asarray((cross > 0).all(axis=1) | (cross < 0).all(axis=1))

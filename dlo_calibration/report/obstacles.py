@@ -16,14 +16,13 @@ import numpy as np
 from dlo_calibration.model.action import rotation_matrix
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.report.figure import EDGE, OBSTACLE
-from dlo_calibration.simulation.scene import Obstacle
+from dlo_calibration.simulation.scene import AROUND, extremes, Obstacle
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 MOST_TRIANGLES = 5000  # shown of a mesh; more cannot be distinguished
 CELLS = 40  # along the longest edge of a mesh, of which each keeps one corner
-AROUND = 64  # corners of a circle
 ABOVE = np.eye(3)[:2]  # the projection seen from above
 
 
@@ -45,7 +44,11 @@ def outline(obstacle: Obstacle, projection: Floats) -> Floats:
     """Return the outline in a projection, (k, 2) [m], anticlockwise; of a mesh, its convex hull."""
     from scipy.spatial import ConvexHull, QhullError
 
-    points = _surface(obstacle) @ projection.T
+    points, radius = extremes(obstacle)
+    points = points @ projection.T
+    if radius:
+        turns = np.linspace(0, 2 * np.pi, AROUND, endpoint=False)
+        points = (points[:, None] + radius * np.column_stack([np.cos(turns), np.sin(turns)])).reshape(-1, 2)
     try:
         corners: Floats = points[ConvexHull(points).vertices]
     except QhullError:  # a flat mesh, seen along its plane
@@ -77,28 +80,6 @@ def draw_obstacles(axes: Axes, obstacles: Sequence[Obstacle], projection: Floats
         axes.add_collection(PolyCollection(
             shapes, facecolor=OBSTACLE, edgecolor=EDGE if len(shapes) == 1 else OBSTACLE, linewidth=0.8,
             zorder=0.6, label=None if number else 'obstacle'), autolim=False)
-
-
-def _surface(obstacle: Obstacle) -> Floats:
-    """Return points, (m, 3) [m], whose convex hull is that of the obstacle."""
-    if obstacle.shape == 'mesh':
-        return triangles_of(obstacle).reshape(-1, 3)
-    if obstacle.shape == 'box':
-        signs = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T
-        points = signs * obstacle.sizes
-    else:
-        radius = obstacle.sizes[-1]
-        # Circles of latitude make a sphere, or both ends of a capsule; a cylinder has only its rims.
-        turns = np.linspace(0, 2 * np.pi, AROUND, endpoint=False)
-        rises = np.linspace(-np.pi / 2, np.pi / 2, AROUND // 2 + 1) if obstacle.shape != 'cylinder' else 0.0
-        turn, rise = (angles.ravel() for angles in np.meshgrid(turns, rises))
-        points = radius * np.stack([np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn),
-                                    np.sin(rise)], axis=1)
-        if obstacle.shape != 'sphere':
-            half = np.array([0.0, 0.0, obstacle.sizes[0] / 2])
-            points = np.concatenate([points - half, points + half])
-    placed: Floats = points @ rotation_matrix(obstacle.turn).T + obstacle.position
-    return placed
 
 
 def _coarser(triangles: Floats) -> Floats:

@@ -53,6 +53,8 @@ MOST_TEXT = 100  # characters of an attribute with numbers
 excerpt = partial(shortened, most=60)  # of a text of the file, for errors
 SMALLEST, LARGEST = 1e-6, FURTHEST  # m; sizes of shapes, and the scale of a mesh
 
+AROUND = 64  # corners of a circle
+
 NO_TRIANGLES = frozen_array(np.zeros((0, 3, 3)))
 
 #: shape -> its attributes that are sizes [m]
@@ -139,6 +141,27 @@ def core_body(obstacle: Obstacle) -> core.Body:
         raise InputError('scene', f'{error}', 'closed meshes', 'close it in the program that made it, or use '
                          'engine bullet') from error
     return core.Body.of_grid(grid.shared, obstacle.position, turn, obstacle.friction)
+
+
+def extremes(obstacle: Obstacle) -> tuple[Floats, float]:
+    """Return points, (m, 3) [m], and a radius [m]; the hull of balls around these points is the obstacle."""
+    from scipy.spatial.transform import Rotation  # slow to load
+
+    sizes, radius = obstacle.sizes, 0.0
+    if obstacle.shape == 'box':
+        local = np.stack(np.meshgrid(*([-0.5, 0.5],) * 3), axis=-1).reshape(-1, 3) * sizes
+    elif obstacle.shape == 'sphere':
+        local, radius = np.zeros((1, 3)), float(sizes[0])
+    elif obstacle.shape == 'capsule':
+        local, radius = np.array([[0, 0, -0.5], [0, 0, 0.5]]) * sizes[0], float(sizes[1])
+    elif obstacle.shape == 'cylinder':
+        angles = 2 * np.pi * np.arange(AROUND) / (AROUND)
+        circle = np.column_stack([np.cos(angles), np.sin(angles)]) * sizes[1]
+        local = np.vstack([np.column_stack([circle, np.full(len(circle), z)])
+                           for z in (-sizes[0] / 2, sizes[0] / 2)])
+    else:
+        local = obstacle.triangles.reshape(-1, 3) * sizes
+    return Rotation.from_quat(obstacle.turn).apply(local) + obstacle.position, radius
 
 
 def unusable(path: str, came: str, remedy: str = 'correct the file') -> InputError:

@@ -101,7 +101,6 @@ class Observer:
 
     def __init__(self, scale: Scale | BoardFinder | None, count: int = COUNT) -> None:
         self._given, self._tracker, self._finder = scale, Tracker(count), TagFinder()
-        self._last: Scale | None = None
         self._time = 0.0
 
     def start(self, time: float, pixels: Pixels, clicks: ArrayLike) -> ImageView:
@@ -129,11 +128,7 @@ class Observer:
         return self._view(time, pixels, scale, self._tracker.next(pixels, elapsed, scale))
 
     def _scale(self, pixels: Pixels) -> Scale | None:
-        if isinstance(self._given, BoardFinder):
-            # Where a hand hides the board for a moment, the camera is where it was.
-            self._last = self._given.next(pixels) or self._last
-            return self._last
-        return self._given
+        return self._given.next(pixels) if isinstance(self._given, BoardFinder) else self._given
 
     def _view(self, time: float, pixels: Pixels, scale: Scale | None, tracked: Tracked) -> ImageView:
         if scale is None:

@@ -31,6 +31,7 @@ NEAR = 2.5  # sides of a tag around where it was seen last, in which it is looke
 EVERYWHERE = 5  # pictures from one search of the whole picture to the next, while all tags are seen nearby
 CELL, EDGE = 6, 0.5  # px of a cell in the picture with which a tag is aligned, and blur of its edges
 ALIGNMENT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-5)
+ALIKE = 0.9  # correlation with its printed picture of a tag whose code is not read
 CORNER = 0.1  # px, standard deviation of a corner; only its ratio to TURN counts
 TURN = np.deg2rad(15.0)  # by which a tag turns from one picture to the next
 WINDOW = 0.08  # s, standard deviation of the times over which a path is smoothed
@@ -55,6 +56,7 @@ class TagFinder:
 
     def __init__(self) -> None:
         self._last: dict[int, Floats] = {}  # corners (4, 2) [px]
+        self._steps: dict[int, Floats] = {}  # since the picture before, likewise
         self._count = 0
 
     def find(self, pixels: Pixels) -> dict[int, Floats]:
@@ -75,7 +77,18 @@ class TagFinder:
         if self._count % EVERYWHERE == 0 or len(found) < len(self._last):
             found = {**_found(grey), **found}
         self._count += 1
-        self._last = {number: _aligned(grey, number, corners) for number, corners in found.items()}
+        before, self._last = self._last, {}
+        for number, corners in found.items():
+            aligned, alike = _aligned(grey, number, corners)
+            self._last[number] = corners if aligned is None else aligned
+            self._steps[number] = self._last[number] - before.get(number, self._last[number])
+        for number, corners in before.items():
+            if number not in found:
+                # A small or blurred tag whose code is not read still looks like itself where it moves on.
+                aligned, alike = _aligned(grey, number, corners + self._steps[number])
+                if aligned is not None and alike > ALIKE:
+                    self._steps[number] = aligned - corners
+                    self._last[number] = aligned
         return dict(self._last)
 
 
@@ -97,9 +110,11 @@ def _found(grey: Pixels) -> dict[int, Floats]:
             if number < TAGS}
 
 
-def _aligned(grey: Pixels, number: int, corners: Floats) -> Floats:
+def _aligned(grey: Pixels, number: int, corners: Floats) -> tuple[Floats | None, float]:
     """
     Return the corners (4, 2) [px] of a tag to a few hundredths of a pixel, from rough ones.
+
+    They are None where it is not found; the correlation of the picture with the tag follows, at most 1.
 
     The view of the whole printed tag that correlates best with the picture is found (Evangelidis and
     Psarakis, Parametric image alignment using enhanced correlation coefficient maximization, 2008): all
@@ -116,11 +131,11 @@ def _aligned(grey: Pixels, number: int, corners: Floats) -> Floats:
     piece = np.square(np.ascontiguousarray(grey[top:bottom, left:right], np.float32))
     view = cv2.getPerspectiveTransform(places, (corners - (left, top)).astype(np.float32)).astype(np.float32)
     try:
-        _, view = cv2.findTransformECC(template, piece, view, cv2.MOTION_HOMOGRAPHY, ALIGNMENT, None, 1)
+        alike, view = cv2.findTransformECC(template, piece, view, cv2.MOTION_HOMOGRAPHY, ALIGNMENT, None, 1)
     except cv2.error:  # it does not converge, as where something covers a part of the tag
-        return corners
+        return None, 0.0
     better = cv2.perspectiveTransform(places[:, None], view)[:, 0].astype(float) + (left, top)
-    return better if np.abs(better - corners).max() < reach else corners
+    return (better, float(alike)) if np.abs(better - corners).max() < reach else (None, 0.0)
 
 
 @dataclass(frozen=True, eq=False)

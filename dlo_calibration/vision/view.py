@@ -15,16 +15,19 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.vision.board import FEWEST_CORNERS, find_board, RULER
+from dlo_calibration.vision.board import COLUMNS, FEWEST_CORNERS, find_board, ROWS, RULER, SQUARE
 from dlo_calibration.vision.film import Film
 from dlo_calibration.vision.lens import Lens
 from dlo_calibration.vision.photograph import Pixels
 from dlo_calibration.vision.pose import scale_from_points
 from dlo_calibration.vision.scale import Scale
+
+Bools = NDArray[np.bool_]
 
 VIEWS = 8  # images that give the focal length, evenly over the film
 CORNER = 0.5  # px, standard deviation of a corner
@@ -33,7 +36,15 @@ ORDINARY = 26.0 / math.hypot(36.0, 24.0)  # focal length of the picture's diagon
 AGAIN = 30  # images from one search for the board to the next
 WINDOW = (25, 25)  # px, in which a corner is followed
 MARGIN = 40  # px around the board, where it is followed
-STRAY = 1.5  # px by which a corner may lie beside the view of the others
+BORDER = 10.0  # px; a corner nearer to the picture's border is not sought
+REFINED = (5, 5)  # px around a corner, where it is sought
+REFINEMENT = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 20, 0.01)
+BESIDE = 0.12  # sides of a square from a corner, where the white of a square is free of its marker
+CONTRAST = 20  # of 255, by which white squares are brighter than black ones
+STRAY = 1.0  # px by which a corner may lie beside the view of the others
+BENT = 3.0  # px, the same where the lens's distortion is unknown
+POOR = 0.5  # px, deviation of the corners from the view, from which on they are not all the board's
+UNSURE = 0.002  # m, deviation of places in the picture from which on the view is not known
 STILL = 0.25  # px: a camera on a stand shows the board moved by less
 
 
@@ -51,83 +62,154 @@ class BoardFinder:
         self._corners, self._places = np.zeros((0, 2)), np.zeros((0, 2))
         self._grey: Pixels | None = None
         self._shown: Floats = np.zeros((0, 2))  # corners when the scale was made
-        self._count = 0
+        self._since = AGAIN  # images since the last search
+        self._moves = False
 
     def next(self, pixels: Pixels) -> Scale | None:
         """
-        Return the scale of the next image; None: too little of the board is seen.
+        Return the scale of the next image; None: too little of the board is seen to tell it.
 
-        While the camera does not move, it is the same one.
+        While the camera does not move, it is the same one, also where something hides the board.
 
         :param pixels: (h, w, 3) RGB.
         """
-        grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
-        self._count += 1
-        still = False
-        if len(self._corners) and self._grey is not None:
-            still = self._follow(self._grey, grey)
-        if not len(self._corners) or (self._count % AGAIN == 0 and not still):
-            self._find(pixels)
-        self._grey = np.asarray(grey, np.uint8)
-        if not len(self._corners):
-            return None
-        if self._scale is None or not still:
-            self._scale = self._posed()
-            self._shown = self._corners
+        grey = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), np.uint8)
+        self._since += 1
+        corners, kept = self._corners, np.zeros(len(self._corners), bool)
+        if self._grey is not None and len(corners):
+            corners, kept = self._followed(self._grey, grey)
+            near = kept & (np.linalg.norm(corners - self._shown, axis=1) < STILL)
+            if self._scale is not None and near.sum() >= max(FEWEST_CORNERS, len(near) / 4):
+                corners, kept = self._shown, near
+        self._grey = grey
+        if corners is not self._shown or not len(corners):
+            if len(corners):
+                corners, kept = self._on_board(grey, corners, kept)
+            if 2 * kept.sum() < (COLUMNS - 1) * (ROWS - 1) and (not kept.any() or self._since >= AGAIN):
+                corners, kept = self._found(pixels, corners, kept)
+            scale = self._posed(corners, kept)
+            if self._scale is not None and not self._moves and (scale is None or self._still(corners, kept)):
+                # The camera stands; something hides the board, or hid it.
+                self._corners = self._shown
+                return self._scale
+            self._moves = self._moves or self._scale is not None and scale is not None
+            self._scale, self._shown = scale, corners
+        self._corners = corners if kept.any() else corners[:0]
         return self._scale
 
-    def _find(self, pixels: Pixels) -> None:
-        try:
-            self._corners, self._places = find_board(pixels, self._printed)
-        except InputError:
-            self._corners, self._places = np.zeros((0, 2)), np.zeros((0, 2))
-        self._scale = None
+    def _still(self, corners: Floats, kept: Bools) -> bool:
+        """Return whether the corners that are seen are where the last scale has them."""
+        assert self._scale is not None
+        places = np.column_stack([self._places, np.zeros(len(self._places))])[kept]
+        away = np.linalg.norm(self._scale.to_pixels(places) - corners[kept], axis=1)
+        return bool(np.median(away) < 2.0 * STILL)
 
-    def _follow(self, before: Pixels, now: Pixels) -> bool:
-        """Follow the corners; tell whether they are where they were."""
+    def _found(self, pixels: Pixels, corners: Floats, kept: Bools) -> tuple[Floats, Bools]:
+        """Return the corners found anew, if they are more than those that are followed."""
+        self._since = 0
+        try:
+            found, places = find_board(pixels, self._printed)
+        except InputError:
+            return corners, kept
+        if len(found) <= kept.sum():
+            return corners, kept
+        self._places = _all_places(self._printed)
+        view, _ = cv2.findHomography(places, self._lens.undistorted(found), cv2.RANSAC, STRAY)
+        if view is None:
+            return corners, kept
+        shown = self._lens.distorted(cv2.perspectiveTransform(self._places[:, None], view)[:, 0])
+        grey = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), np.uint8)
+        return _sought(grey, shown, self._places, STRAY)
+
+    def _followed(self, before: Pixels, now: Pixels) -> tuple[Floats, Bools]:
+        """Return where the corners (k, 2) have moved to, and which are seen."""
         height, width = now.shape
-        low = np.maximum(np.floor(self._corners.min(axis=0)).astype(int) - MARGIN, 0)
-        high = np.minimum(np.ceil(self._corners.max(axis=0)).astype(int) + MARGIN, (width, height))
+        low = np.clip(np.floor(self._corners.min(axis=0)).astype(int) - MARGIN, 0, (width - 1, height - 1))
+        high = np.clip(np.ceil(self._corners.max(axis=0)).astype(int) + MARGIN, low + 1, (width, height))
         part = slice(low[1], high[1]), slice(low[0], high[0])
         start = (self._corners - low).astype(np.float32)[:, None]
         places: Any
         places, found, _ = cv2.calcOpticalFlowPyrLK(
             before[part], now[part], start, None, winSize=WINDOW, maxLevel=2)
-        corners = places[:, 0].astype(float) + low
-        kept = found[:, 0] > 0
-        if kept.sum() < FEWEST_CORNERS:
-            self._corners = self._corners[:0]
-            return False
-        view, _ = cv2.findHomography(self._places[kept], corners[kept], cv2.RANSAC, STRAY)
-        if view is None:
-            self._corners = self._corners[:0]
-            return False
-        shown = cv2.perspectiveTransform(self._places[:, None], view)[:, 0]
-        kept &= np.linalg.norm(shown - corners, axis=1) < STRAY
-        if len(self._shown) == len(corners):
-            moved = np.linalg.norm(corners[kept] - self._shown[kept], axis=1)
-            if kept.sum() >= FEWEST_CORNERS and np.median(moved) < STILL:
-                # Something may hide some of the corners; they are still where they were.
-                self._corners = self._shown
-                return True
-        if kept.sum() < FEWEST_CORNERS:
-            self._corners = self._corners[:0]
-            return False
-        # A corner that something hides reappears where the others say.
-        self._corners = np.where(kept[:, None], corners, shown)
-        return False
+        return places[:, 0].astype(float) + low, found[:, 0] > 0
 
-    def _posed(self) -> Scale:
-        """Return the scale that the corners show."""
+    def _on_board(self, grey: Pixels, corners: Floats, kept: Bools) -> tuple[Floats, Bools]:
+        """Return corners (k, 2) where the image shows them, or where the others say, and which are seen."""
+        ideal = self._lens.undistorted(corners)
+        kept = kept & np.isfinite(ideal[:, 0])
+        for _ in range(2):
+            if kept.sum() < FEWEST_CORNERS:
+                return corners, np.zeros(len(corners), bool)
+            view, _ = cv2.findHomography(self._places[kept], ideal[kept], cv2.RANSAC, STRAY)
+            if view is None:
+                return corners, np.zeros(len(corners), bool)
+            shown = cv2.perspectiveTransform(self._places[:, None], view)[:, 0]
+            # From where the others say, each is sought anew, so that no errors add up from image to image.
+            corners, kept = _sought(grey, self._lens.distorted(shown), self._places, STRAY)
+            ideal = self._lens.undistorted(corners)
+        return corners, kept
+
+    def _posed(self, corners: Floats, kept: Bools) -> Scale | None:
+        """Return the scale that the corners show; None: they do not tell it well enough."""
+        if kept.sum() < FEWEST_CORNERS:
+            return None
+        seen, places = corners[kept], self._places[kept]
         if self._scale is None:
-            return scale_from_points(self._corners, self._places, self._lens.size, self._lens)
-        ideal = self._lens.undistorted(self._corners)
-        points = np.column_stack([self._places, np.zeros(len(self._places))])
-        turn, shift = cv2.Rodrigues(self._scale.rotation)[0], self._scale.translation.reshape(3, 1).copy()
-        _, turn, shift = cv2.solvePnP(points, ideal, self._lens.matrix, np.zeros(4), turn, shift, True)
-        scale = Scale(self._lens, cv2.Rodrigues(turn)[0], shift.ravel(), np.zeros(1), True)
-        residuals = np.linalg.norm(scale.points(self._corners)[:, :2] - self._places, axis=1)
+            try:
+                scale = scale_from_points(seen, places, self._lens.size, self._lens)
+            except InputError:
+                return None
+            turn, shift = cv2.Rodrigues(scale.rotation)[0], scale.translation.reshape(3, 1).copy()
+        else:
+            turn, shift = cv2.Rodrigues(self._scale.rotation)[0], self._scale.translation.reshape(3, 1).copy()
+        points, ideal = np.column_stack([places, np.zeros(len(places))]), self._lens.undistorted(seen)
+        _, turn, shift = cv2.solvePnP(points, ideal, self._lens.matrix, None, turn, shift, True)
+        shown, slopes = cv2.projectPoints(points, turn, shift, self._lens.matrix, None)
+        errors = (shown[:, 0] - ideal).ravel()
+        deviation = math.sqrt((np.square(errors).sum() + CORNER**2) / (len(errors) - 5))
+        covariance = deviation**2 * np.linalg.pinv(slopes[:, :6].T @ slopes[:, :6])
+        scale = Scale(self._lens, cv2.Rodrigues(turn)[0], shift.ravel(), np.zeros(1), True,
+                      covariance=covariance)
+        quarters = np.array([(x, y) for x in (0.25, 0.75) for y in (0.25, 0.75)]) * self._lens.size
+        if not (deviation < POOR and scale.uncertainty(quarters).max() < UNSURE):
+            return None
+        residuals = np.linalg.norm(scale.points(seen)[:, :2] - places, axis=1)
         return Scale(self._lens, scale.rotation, scale.translation, residuals, True)
+
+
+def _all_places(printed: float) -> Floats:
+    """Return the places (48, 2) of all corners between the squares in the board's frame [m]."""
+    columns, rows = np.meshgrid(np.arange(1, COLUMNS), np.arange(1, ROWS))
+    return np.column_stack([columns.ravel(), rows.ravel()]).astype(float) * (SQUARE * printed / RULER)
+
+
+def _sought(grey: Pixels, expected: Floats, places: Floats, stray: float) -> tuple[Floats, Bools]:
+    """
+    Return all corners (48, 2) [px], those that are not seen as expected, and which are seen.
+
+    A corner is seen where two black squares meet, at most `stray` pixels from where it is expected.
+    """
+    height, width = grey.shape
+    inside: Bools = np.all((expected > BORDER) & (expected < (width - BORDER, height - BORDER)), axis=1)
+    corners = expected.copy()
+    if not inside.any():
+        return corners, inside
+    start = np.ascontiguousarray(expected[inside], np.float32)[:, None].copy()
+    sought = cv2.cornerSubPix(grey, start, REFINED, (-1, -1), REFINEMENT)[:, 0].astype(float)
+    corners[inside] = np.where(np.linalg.norm(sought - expected[inside], axis=1)[:, None] < stray, sought,
+                               np.nan)
+    # The four squares around it: those of even column and row, counted from the upper left, are black.
+    view, _ = cv2.findHomography(places, expected, 0)
+    side = float(places[1, 0] - places[0, 0])
+    steps = BESIDE * side * np.array([[-1, 1], [1, -1], [1, 1], [-1, -1]])
+    around = cv2.perspectiveTransform((places[:, None] + steps).reshape(-1, 1, 2), view).reshape(-1, 4, 2)
+    at = (around + (corners - expected)[:, None]).astype(np.float32)
+    shades = cv2.remap(grey, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderValue=0).astype(float)
+    column, row = np.rint(places / side).astype(int).T
+    even = ((column + ROWS - row) % 2 == 0)[:, None]
+    first, second = np.where(even, shades[:, :2], shades[:, 2:]), np.where(even, shades[:, 2:], shades[:, :2])
+    kept = inside & np.isfinite(corners[:, 0]) & (second.min(axis=1) - first.max(axis=1) > CONTRAST)
+    return np.where(kept[:, None], corners, expected), kept
 
 
 def film_lens(film: Film, printed: float = RULER) -> Lens:
@@ -143,13 +225,29 @@ def film_lens(film: Film, printed: float = RULER) -> Lens:
         if frame is None:
             break
         try:
-            views.append(find_board(frame.pixels, printed))
+            views.append(_whole_board(frame.pixels, printed))
         except InputError as refused:
             error = refused
     if not views:
         raise error or InputError('film', 'no image that shows the board', 'the board beside the DLO',
                                   'lay the board on the table')
     return _lens_of(views, film.size)
+
+
+def _whole_board(pixels: Pixels, printed: float) -> tuple[Floats, Floats]:
+    """
+    Return pixels (k, 2) and places (k, 2) [m] of the board's corners, also of those beside unread markers.
+
+    :raises InputError: where the board is not seen.
+    """
+    found, at = find_board(pixels, printed)
+    view, _ = cv2.findHomography(at, found, cv2.RANSAC, BENT)
+    places = _all_places(printed)
+    if view is None:
+        return found, at
+    grey = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), np.uint8)
+    corners, kept = _sought(grey, cv2.perspectiveTransform(places[:, None], view)[:, 0], places, BENT)
+    return (corners[kept], places[kept]) if kept.sum() > len(found) else (found, at)
 
 
 def _lens_of(views: list[tuple[Floats, Floats]], size: tuple[int, int]) -> Lens:
@@ -168,18 +266,21 @@ def _lens_of(views: list[tuple[Floats, Floats]], size: tuple[int, int]) -> Lens:
         start.append(scale.parameters[:6])
         start[0] = start[0] + np.array([scale.parameters[6] - ordinary, 0.0]) / len(views)
 
-    def errors(values: Floats) -> Floats:
+    def errors(values: Floats, deviation: float) -> Floats:
         assumed = lens(values[:2])
         rows = [np.array([(values[0] - ordinary) / FOCAL, values[1] / DISTORTION])]
         for k, (pixels, places) in enumerate(views):
             pose = values[2 + 6 * k:8 + 6 * k]
             points = np.column_stack([places, np.zeros(len(places))])
             seen, _ = cv2.projectPoints(points, pose[:3], pose[3:], assumed.matrix, assumed.coefficients)
-            rows.append((seen.reshape(-1, 2) - pixels).ravel() / CORNER)
+            rows.append((seen.reshape(-1, 2) - pixels).ravel() / deviation)
         return np.concatenate(rows)
 
-    solution = least_squares(errors, np.concatenate(start), method='lm', x_scale='jac')
-    return lens(solution.x[:2])
+    found, deviation = np.concatenate(start), CORNER
+    for _ in range(2):  # the second time, the corners themselves tell how exact they are
+        found = least_squares(errors, found, loss='soft_l1', x_scale='jac', args=(deviation,)).x
+        deviation *= 1.4826 * float(np.median(np.abs(errors(found, deviation)[2:])))
+    return lens(found[:2])
 
 
 def first_lens(pixels: Pixels, printed: float = RULER) -> Lens:
@@ -188,4 +289,4 @@ def first_lens(pixels: Pixels, printed: float = RULER) -> Lens:
 
     :raises InputError: where the board is not seen.
     """
-    return _lens_of([find_board(pixels, printed)], (pixels.shape[1], pixels.shape[0]))
+    return _lens_of([_whole_board(pixels, printed)], (pixels.shape[1], pixels.shape[0]))

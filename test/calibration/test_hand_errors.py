@@ -79,6 +79,7 @@ def test_hands_that_are_right_cost_the_other_intervals_little():
         assert width(wider, name) <= 1.1 * width(right, name), name
 
 
+@pytest.mark.long
 def test_an_error_that_is_not_corrected_makes_the_result_unusable_and_names_the_remedy():
     result = fit(late=-0.08)
     assert "hands' stamps seem" in result.unusable and 'add hand_delay to calibrate' in result.unusable

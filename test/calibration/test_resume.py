@@ -65,7 +65,7 @@ def trials_of(name):
 
 
 @pytest.mark.parametrize('name', [
-    pytest.param(name, marks=pytest.mark.long) if name == 'cma-es' else name for name in CHOICES])
+    pytest.param(name, marks=pytest.mark.long) if name in ('cma-es', 'stream') else name for name in CHOICES])
 def test_nothing_is_simulated_twice_and_the_result_is_the_same(name, tmp_path):
     """The kills hit the search, the examination, the advice and the confirmation by another engine."""
     options, trials, whole = options_of(name), trials_of(name), Engines()

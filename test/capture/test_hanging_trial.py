@@ -61,7 +61,8 @@ def traced_by(folder, scale):
     return traced(folder, camera, *flags, '--clamps', in_clamps(camera), off=10.0)
 
 
-@pytest.mark.parametrize('scale', ['length', 'gap', 'points'])
+@pytest.mark.parametrize('scale', ['length', *(pytest.param(name, marks=pytest.mark.long)
+                                              for name in ('gap', 'points'))])
 def test_the_chain_of_a_loop_stands_upright_and_is_clamped_at_both_ends(tmp_path, scale):
     trials, options = traced_by(tmp_path, scale)
     trial, (shape, _) = trials[0], loop()

@@ -89,6 +89,7 @@ def test_all_files_are_written_and_the_tables_printed(run, session, tmp_path):
             assert min(Image.open(tmp_path / 'out' / name).size) > 300
 
 
+@pytest.mark.long
 def test_the_json_document_is_the_file_and_has_the_recovered_truth(run, session, tmp_path, undrawn):
     code, output, _ = run(session, '--runs', 2, '--search', 'least_squares', '--json',
                           '--output', tmp_path / 'out')

@@ -14,6 +14,7 @@ from dlo_calibration.planning import beam
 from dlo_calibration.planning.options import PlanOptions
 from dlo_calibration.planning.planner import plan
 from dlo_calibration.planning.surroundings import outline, passed_wrongly, Surroundings
+from dlo_calibration.planning.ways import way_around
 from dlo_calibration.simulation.scene import NO_TRIANGLES, Obstacle, read_scene
 
 DLO = MadeUpDlo()
@@ -69,7 +70,7 @@ def test_a_way_keeps_the_clearance_and_passes_bodies_at_the_given_side(side, tur
         0, 0, np.sin(turn / 2), np.cos(turn / 2))))
     around = Surroundings.of(obstacles, CLEARANCE)
     given = np.array([[0.0, 0.0], [0.2, 0.08 * side], [0.4, 0.08 * side], [0.6, 0.0]])
-    way = around.way(given, LEVEL)
+    way = way_around(around, given, LEVEL)
     np.testing.assert_array_equal(way[[0, -1]], given[[0, -1]])
     lengths = [np.linalg.norm(np.diff(each, axis=0), axis=1).sum() for each in (way, given)]
     assert lengths[0] < lengths[1]
@@ -87,14 +88,14 @@ def test_a_place_that_a_ring_of_bodies_encloses_has_no_way():
     ring = [post(0.1 * np.cos(angle), 0.1 * np.sin(angle)) for angle in np.linspace(0, 2 * np.pi, 24)]
     around = Surroundings.of(ring, CLEARANCE)
     out = np.array([[0.0, 0.0], [0.3, 0.0]])
-    assert around.way(out, LEVEL) is None
+    assert way_around(around, out, LEVEL) is None
     assert around.above(out, LEVEL) == pytest.approx(HEIGHT + CLEARANCE, abs=2e-3)
 
 
 def test_the_outline_encloses_a_body_closely():
     turned = box((0.04, 0.02, 0.1), (1.0, 2.0, 0.05), (0, 0, np.sin(0.3), np.cos(0.3)))
     for obstacle, area in ((post(1, 2), np.pi * RADIUS**2), (turned, 0.04 * 0.02)):
-        x, y = (outline(obstacle) - (1, 2)).T
+        x, y = (outline(obstacle, 48) - (1, 2)).T
         found = np.abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2
         assert area <= found < 1.1 * area
 

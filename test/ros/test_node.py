@@ -258,8 +258,8 @@ def test_signal_while_it_calibrates_ends_cleanly(ros_environment, tmp_path, numb
 
 
 @pytest.mark.parametrize(('number', 'delay'), [
-    (signal.SIGINT, 0.5), (signal.SIGTERM, 0.9), (signal.SIGINT, 1.4),
-    pytest.param(signal.SIGTERM, 2.5, marks=pytest.mark.long)])
+    (signal.SIGTERM, 0.9), *(pytest.param(number, delay, marks=pytest.mark.long) for number, delay in (
+        (signal.SIGINT, 0.5), (signal.SIGINT, 1.4), (signal.SIGTERM, 2.5)))])
 def test_signal_at_any_time_while_it_starts_ends_cleanly(ros_environment, tmp_path, number, delay):
     marker = tmp_path / 'listening'
     program = (

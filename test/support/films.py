@@ -20,6 +20,8 @@ FINENESS = 0.0003  # m of one pixel of the table
 SUB = 2  # pixels to a pixel of the picture, while lines are painted
 LAYERS = np.array([1.0, 0.93, 0.84, 0.72, 0.58, 0.42, 0.24])  # of the radius: each brighter than the last one
 SHADOW = 2  # pixels of the picture to one of a shadow
+FILTER = 0.4  # standard deviation of a pixel's share of what it shows, in pixels
+WIDER = 1.4  # px by which OpenCV paints a smooth line of an even thickness wider
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +75,7 @@ class Renderer:
                           borderMode=cv2.BORDER_REFLECT)
         for sheet in look.sheets:
             _lay(table, sheet, places)
-        self._table = np.rint(np.sqrt(np.clip(table, 0, 1)) * 255).astype(np.uint8)
+        self._table, self._filtered = table, False
         #: from pixels of the table's picture to its places
         self._placed = np.array([[FINENESS, 0, low[0]], [0, -FINENESS, high[1]], [0, 0, 1]])
         azimuth, elevation = look.lamp
@@ -98,6 +100,7 @@ class Renderer:
         width, height = camera.size
         seen = camera.matrix @ np.column_stack(
             [camera.rotation[:, :2], -camera.rotation @ camera.position]) @ self._placed
+        self._filter(camera)
         image = cv2.warpPerspective(self._table, seen, camera.size, flags=cv2.INTER_LINEAR,
                                     borderMode=cv2.BORDER_REPLICATE)
         image = np.square(image.astype(np.float32) * np.float32(1 / 255))
@@ -111,11 +114,21 @@ class Renderer:
             view = cv2.getPerspectiveTransform(
                 np.float32([[0, 0], [side, 0], [side, side], [0, side]]) - np.float32(0.5), corners)
             flat = np.square(tag.image.astype(np.float32) / 255) * np.float32(0.8)
-            painted = cv2.warpPerspective(flat, view, (width, height), flags=cv2.INTER_AREA)
+            fineness = side / float(np.linalg.norm(corners[0] - corners[1]))
+            flat = cv2.GaussianBlur(flat, (0, 0), FILTER * fineness, borderType=cv2.BORDER_REPLICATE)
+            painted = cv2.warpPerspective(flat, view, (width, height))
             cover = cv2.warpPerspective(np.ones_like(flat), view, (width, height))
             image *= 1 - cover[..., None]
             image += painted[..., None]
         return image
+
+    def _filter(self, camera):
+        """Filter the picture of the table for pixels as those of the first camera: they take all light."""
+        if not self._filtered:
+            fineness = np.linalg.norm(camera.position) / camera.focal_length / FINENESS
+            table = cv2.GaussianBlur(self._table, (0, 0), FILTER * max(fineness, 1.0))
+            self._table = np.rint(np.sqrt(np.clip(table, 0, 1)) * 255).astype(np.uint8)
+            self._filtered = True
 
     def _shade(self, image, camera, capsules):
         """Take light away from the table below a DLO and hands."""
@@ -195,7 +208,8 @@ def _lines(image, starts, ends, wide, colours):
     """Paint lines with round ends."""
     for a, b, width, colour in zip(np.rint(np.clip(starts, -9000, 9000) * 16).astype(int).tolist(),
                                    np.rint(np.clip(ends, -9000, 9000) * 16).astype(int).tolist(),
-                                   np.maximum(np.rint(wide), 1).astype(int).tolist(), colours, strict=True):
+                                   np.maximum(2 * np.rint((wide - WIDER) / 2), 1).astype(int).tolist(),
+                                   colours, strict=True):
         cv2.line(image, a, b, colour, width, cv2.LINE_AA, 4)
 
 

@@ -36,7 +36,7 @@ def distance(points, truth):
 
 @pytest.mark.parametrize('truth', [
     pytest.param(lifted(), id='an end', marks=pytest.mark.long), pytest.param(lifted(0.5), id='the middle'),
-    pytest.param(lifted(0.3, bend=1.3), id='strongly bent'),
+    pytest.param(lifted(0.3, bend=1.3), id='strongly bent', marks=pytest.mark.long),
     pytest.param(curve(), id='it lies', marks=pytest.mark.long)])
 @pytest.mark.parametrize('side', SIDES.values(), ids=SIDES)
 def test_the_curve_in_space_is_found(truth, side):

@@ -54,7 +54,7 @@ struct Touch {
 /// A body and a segment whose gap is within the Verlet skin.
 struct Near {
   int body, segment;
-  double room;  // [m] that any node may move until they can touch
+  double room;  // [m] that `SceneContact::moved` may become until they can touch
 };
 
 /// Contact is that of the capsules around the segments, so that nothing passes between two nodes.  What lies
@@ -64,7 +64,9 @@ struct SceneContact {
   double radius = 0.0, friction = 0.0;
   std::vector<double> allowed;             // [m] least gap, for each body at each node and between two nodes
   std::vector<Near> near;                  // sorted
-  double room = -1.0;                      // [m] that any node may move until `near` is out of date
+  double moved = 0.0;                      // [m] that any node may have moved since `near` was found
+  double room = -1.0;                      // [m] that `moved` may become until `near` is out of date
+  double least_room = 0.0;                 // [m] of `near`
   std::vector<Touch> touches, former;      // sorted by body, node and `between`
 };
 

@@ -23,9 +23,13 @@ constexpr double kAllowed = 1e-5;     // m of penetration, as on the table
 /// Find the segments and bodies whose gap is below `reach` [m].
 inline void find_near(SceneContact& contact, const Point* points, int nodes, double reach) {
   contact.near.clear();
+  contact.moved = 0.0, contact.least_room = HUGE_VAL;
   const std::vector<Body>& scene = contact.scene->bodies;
   Point low = points[0], high = points[0];
+  double longest = 0.0;
   for (int i = 1; i < nodes; ++i) {
+    const Point segment = points[i] - points[i - 1];
+    longest = max(longest, dot(segment, segment));
     low = {min(low.x, points[i].x), min(low.y, points[i].y), min(low.z, points[i].z)};
     high = {max(high.x, points[i].x), max(high.y, points[i].y), max(high.z, points[i].z)};
   }
@@ -38,13 +42,15 @@ inline void find_near(SceneContact& contact, const Point* points, int nodes, dou
     const Point away = {outside(body.position.x, low.x, high.x), outside(body.position.y, low.y, high.y),
                         outside(body.position.z, low.z, high.z)};
     if (sqrt(dot(away, away)) > body.reach + far) continue;
+    const double furthest = body.reach + far + 0.5 * sqrt(longest);
     for (int i = 0; i + 1 < nodes; ++i) {
-      const Point middle = 0.5 * (points[i] + points[i + 1]), half = points[i + 1] - middle;
-      const double within = sqrt(dot(half, half)) + far;
-      const Point apart = middle - body.position;
-      if (sqrt(dot(apart, apart)) > body.reach + within) continue;
-      const double beyond = field_of(body, middle).distance - within;
-      if (beyond <= 0.0) contact.near.push_back({k, i, max(beyond + reach, 0.0)});
+      const Point middle = 0.5 * (points[i] + points[i + 1]), apart = middle - body.position;
+      if (dot(apart, apart) > furthest * furthest) continue;
+      const Point half = points[i + 1] - middle;
+      const double beyond = field_of(body, middle).distance - sqrt(dot(half, half)) - far;
+      if (beyond > 0.0) continue;
+      contact.near.push_back({k, i, max(beyond + reach, 0.0)});
+      contact.least_room = min(contact.least_room, contact.near.back().room);
     }
   }
 }
@@ -55,10 +61,14 @@ inline void find_near(SceneContact& contact, const Point* points, int nodes, dou
 template <class Points, class Act>
 inline void each_place(SceneContact& contact, Points points, double coming, Act act) {
   int body = -1, node = -1;
-  double gap = 0.0;
+  double gap = 0.0, least_room = HUGE_VAL;
   Field first{};
+  if (contact.least_room > contact.moved + coming) return;
   for (Near& near : contact.near) {
-    if (near.room > coming) continue;
+    if (near.room > contact.moved + coming) {
+      least_room = min(least_room, near.room);
+      continue;
+    }
     const int i = near.segment;
     const Body& at = contact.scene->bodies[near.body];
     const Point start = points(i), end = points(i + 1);
@@ -71,9 +81,11 @@ inline void each_place(SceneContact& contact, Points points, double coming, Act 
     gap = min(gap, between.share < 0.0 ? between.field.distance - contact.radius
                                        : act(near.body, i, between.share, between.field));
     const double next = act(near.body, i + 1, -1.0, second);
-    near.room = max(min(gap, next), 0.0);
+    near.room = contact.moved + max(min(gap, next), 0.0);
+    least_room = min(least_room, near.room);
     body = near.body, node = i + 1, first = second, gap = next;
   }
+  contact.least_room = least_room;
 }
 
 inline std::size_t place_of(const SceneContact& contact, int body, int node, bool between) {
@@ -223,8 +235,7 @@ inline void solve_among_bodies(Rods<Number>& rods, const Ropes& ropes) {
     SceneContact& contact = ropes[lane]->surroundings;
     if (!contact.scene) continue;
     open[lane] = true;
-    contact.room -= in_lane(moved, lane);
-    for (Near& near : contact.near) near.room -= in_lane(moved, lane);
+    contact.moved += in_lane(moved, lane);
     if (contact.near.empty()) continue;
     find(*ropes[lane], lane, in_lane(moved, lane));
     write_touches(rods, contact, lane);
@@ -239,14 +250,14 @@ inline void solve_among_bodies(Rods<Number>& rods, const Ropes& ropes) {
       if (!open[lane] || in_lane(rods.solved, lane) != 1.0) continue;
       if (k == 1) {
         const double by = in_lane(coming, lane);
-        if (contact.room < by) {
+        if (contact.room < contact.moved + by) {
           const double skin = min(max(kThinSkin, kSkinSteps * by), kThickSkin);
           contact.room = by + skin;
           find_near(contact, current(rope, lane), rods.nodes, contact.room);
           find(rope, lane, by);
-        } else if (by > in_lane(moved, lane)) {
+        } else if (by > in_lane(moved, lane) && contact.least_room <= contact.moved + by) {
           const auto unseen = [&](const Near& near) {
-            return near.room > in_lane(moved, lane) && near.room <= by;
+            return near.room > contact.moved + in_lane(moved, lane) && near.room <= contact.moved + by;
           };
           if (std::any_of(contact.near.begin(), contact.near.end(), unseen)) find(rope, lane, by);
         }
