@@ -109,7 +109,8 @@ inline Between nearest_between(const Body& body, const Point& a, const Point& b,
   if (!(down < 0.0 && up > 0.0)) return {-1.0, {HUGE_VAL, {}}};
   const double crossing = at_a.distance + down * (at_b.distance - up - at_a.distance) / (down - up);
   if (crossing > furthest) return {-1.0, {crossing, {}}};  // of the tangents
-  const double flat = 1e-6 * sqrt(dot(along, along));
+  // A grid is exact to a fraction of its cells; an angle of 1e-4 changes its distances by nanometres.
+  const double flat = (body.shape == Shape::kGrid ? 1e-4 : 1e-6) * sqrt(dot(along, along));
   int side = 0;
   Between best{};
   for (int k = 0; k < 20; ++k) {
