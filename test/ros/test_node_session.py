@@ -3,6 +3,7 @@
 
 """What the node knows and decides, without a graph."""
 
+from dataclasses import replace
 import errno
 import os
 from pathlib import Path
@@ -12,12 +13,14 @@ import time
 
 from exported_scene import write_scene
 import pytest
+from touched_scenes import AROUND_ONE, pegs, PHYSICAL
 from toy_graph import PATIENCE, ToyGraph, TYPES, values, whole
 from toy_messages import MINUTE, session_messages, toy_trials, trial_messages
 from toy_simulator import CountingToy, Stoppable, ToySimulator
 from wire import result_values
 from wrong_input import with_point
 
+from dlo_calibration import Chain
 from dlo_calibration.calibration.engines import make_simulator
 from dlo_calibration.evaluation import EvaluationLog
 from dlo_calibration.files import recording
@@ -27,6 +30,7 @@ from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.inference.trial_information import TrialInformation
 from dlo_calibration.messages.codec import GOAL, INITIAL, INPUT_TYPES, OUTPUT_TYPES
 from dlo_calibration.model.parameters import number
+from dlo_calibration.simulation.compiled import CompiledSimulator
 from dlo_calibration.workspace.folder import calibration_digest
 
 pytestmark = pytest.mark.usefixtures('without_drawings', 'without_slices')
@@ -315,6 +319,26 @@ def test_obstacles_are_shown_with_the_trials(start, tmp_path):
     graph.session.tick()
     names = {marker.ns for marker in graph.heard['markers'][-1].markers}
     assert {'scene/obstacles', 'trial_1/goal'} <= names
+
+
+def test_trials_around_a_peg_are_fitted_with_the_scene_that_the_node_is_given(start, tmp_path):
+    """The DLO was dragged around a peg: without it, no parameters lead there."""
+    peg = ('<robot name="peg"><link name="table"><collision><origin xyz="0.4 0.05 0.05"/><geometry>'
+           '<cylinder length="0.1" radius="0.01"/></geometry></collision></link></robot>')
+    (tmp_path / 'peg.urdf').write_text(peg)
+    chains = CompiledSimulator(obstacles=pegs((0.4, 0.05))).simulate(AROUND_ONE, PHYSICAL).chains
+    seen = replace(AROUND_ONE, goals=tuple(replace(goal, chain=Chain(points)) for goal, points in zip(
+        AROUND_ONE.goals, chains, strict=True)))
+    errors = {}
+    for scene in ('', str(tmp_path / 'peg.urdf')):
+        graph = start(make=make_simulator, scene=scene, engine='compiled', evaluations=15, mass=0.03,
+                      calibrate=('flexibility', 'friction'))
+        graph.send(trial_messages(TYPES, seen, MINUTE))
+        graph.calibrated()
+        errors[scene] = float(whole(graph.heard['result'][-1])['score'])
+        graph.session.close()
+    without, with_it = errors.values()
+    assert with_it < 0.3 * without
 
 
 def test_a_scene_that_cannot_be_used_ends_a_start_by_itself(start):
