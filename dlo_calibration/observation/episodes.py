@@ -16,7 +16,6 @@ from typing import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.action import Hand, NO_ROTATION
@@ -340,16 +339,16 @@ def _hold(seen: Sightings, hand: HandSightings, initial: Chain, motion: Floats, 
     opens = _slips(low - own, closes, opens, stands)
     held = slice(closes, opens + 1)
     moving = grip.path[held][(speed[held] >= STILL) & known[held]]
-    lifts = seen.cameras is None or not len(moving) or bool(
-        np.median(moving[:, 2]) - seen.radius > LIFTED)
+    lifts = seen.cameras is None or bool(
+        len(moving) and np.median(moving[:, 2]) - seen.radius > LIFTED)
     path = grip.path if lifts else _like_the_dlo(times, low, own, held)
     return _Hold(hand.name, grip.place, path, grip.turns, closes, opens, lifts)
 
 
 @dataclass(frozen=True, eq=False)
-class _Grip:
+class _Motion:
     """
-    How a hand may hold the DLO.
+    How a hand and a place of the DLO move together.
 
     :param typical: median distance between the place and where it is in the hand [m]; pictures in which the
         hand has opened do not count much in it, nor in `cost`, which counts the offset, too.
@@ -370,6 +369,8 @@ def _about_vertical(orientations: Floats, start: int) -> Floats:
     A small tag that the camera sees from straight ahead looks the same while it tilts a little; how it turns
     about the line of sight is seen well.
     """
+    from scipy.spatial.transform import Rotation  # takes a quarter of a second to load
+
     turned = np.full_like(orientations, np.nan)
     known = np.isfinite(orientations[:, 0])
     first = Rotation.from_quat(orientations[start])
@@ -380,13 +381,15 @@ def _about_vertical(orientations: Floats, start: int) -> Floats:
 
 
 def _grip(seen: Sightings, hand: HandSightings, turns: Floats, initial: Chain, there: NDArray[np.intp],
-          compared: NDArray[np.intp]) -> _Grip:
+          compared: NDArray[np.intp]) -> _Motion:
     """
     Return the place of the DLO, and its offset from the tag, that move together best.
 
     :param turns: (n, 4) quaternions of the hand.
     :param there: pictures in which the hand is at the resting DLO; `compared`: those of the movement.
     """
+    from scipy.spatial.transform import Rotation  # takes a quarter of a second to load
+
     places = np.linspace(0.0, 1.0, PLACES)
     chains = {int(k): chain for k in compared if (chain := _complete(seen.points[k])) is not None}
     resting = initial.resample(places * initial.length)
@@ -418,7 +421,7 @@ def _grip(seen: Sightings, hand: HandSightings, turns: Floats, initial: Chain, t
     path = np.full((len(turns), 3), np.nan)
     known = np.isfinite(turns[:, 0]) & np.isfinite(hand.positions[:, 0])
     path[known] = hand.positions[known] + Rotation.from_quat(turns[known]).apply(offsets[best])
-    return _Grip(float(places[best]), float(np.median(apart[:, best])), float(cost[best]), path, turns)
+    return _Motion(float(places[best]), float(np.median(apart[:, best])), float(cost[best]), path, turns)
 
 
 def _own(seen: Sightings, place: float) -> Floats:
