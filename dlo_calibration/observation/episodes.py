@@ -38,9 +38,8 @@ LEAVING = 0.6  # s; a hand that leaves a DLO stood still so long before they are
 PARTED = 5  # pictures in a row that show hand and DLO apart
 SLIPPED = 0.0015  # m, by which a held point moves beside its hand when that opens
 LEFT, SIGMAS = 0.005, 5.0  # m, and times what is typical: a grip farther from its hand is left
-HELD = 0.012  # m; from a hand to the point that it holds, at most, over most of the movement
+HELD = 0.012  # m; from a hand to the point that it holds, at most, in half of the movement's pictures
 BESIDE = 0.005  # of a grip's distance from its tag that counts as error: of places alike, the nearest is held
-TRUSTED = 0.9  # of the pictures of a movement; in the others, the tracker may be wrong
 AT_REST = 0.0015  # m; nearer to where a hand closes, it stands there
 REACH = 0.25  # m from a tag to what the hand holds, at most
 LIFTED = 0.008  # m above the table
@@ -326,7 +325,7 @@ def _hold(seen: Sightings, hand: HandSightings, initial: Chain, motion: Floats, 
         hand.orientations, _about_vertical(hand.orientations, closes)]
     grip = min((_grip(seen, hand, rotations, initial, there, compared) for rotations in turned),
                key=lambda grip: grip.cost)
-    if not grip.mean < HELD:
+    if not grip.typical < HELD:
         return None
     own = _own(seen, grip.place)
     apart = np.full(len(times), np.nan)
@@ -340,25 +339,24 @@ def _hold(seen: Sightings, hand: HandSightings, initial: Chain, motion: Floats, 
     opens = _slips(low - own, closes, opens, stands)
     held = slice(closes, opens + 1)
     moving = grip.path[held][(speed[held] >= STILL) & known[held]]
-    lifts = seen.cameras is None or not len(moving) or bool(
-        np.median(moving[:, 2]) - seen.radius > LIFTED)
+    lifts = seen.cameras is None or bool(
+        len(moving) and np.median(moving[:, 2]) - seen.radius > LIFTED)
     path = grip.path if lifts else _like_the_dlo(times, low, own, held)
     return _Hold(hand.name, grip.place, path, grip.turns, closes, opens, lifts)
 
 
 @dataclass(frozen=True, eq=False)
-class _Held:
+class _Motion:
     """
-    How a hand may hold the DLO.
+    How a hand and a place of the DLO move together.
 
-    :param typical: distance between the place and where it is in the hand [m], the median; `mean`: the root
-        mean square of the trusted ones; `cost` counts the offset, too.
+    :param typical: median distance between the place and where it is in the hand [m]; pictures in which the
+        hand has opened do not count much in it, nor in `cost`, which counts the offset, too.
     :param path: (n, 3) where the grip is, as the tag shows it [m], and `turns`, (n, 4); NaN where unknown.
     """
 
     place: float
     typical: float
-    mean: float
     cost: float
     path: Floats
     turns: Floats
@@ -383,7 +381,7 @@ def _about_vertical(orientations: Floats, start: int) -> Floats:
 
 
 def _grip(seen: Sightings, hand: HandSightings, turns: Floats, initial: Chain, there: NDArray[np.intp],
-          compared: NDArray[np.intp]) -> _Held:
+          compared: NDArray[np.intp]) -> _Motion:
     """
     Return the place of the DLO, and its offset from the tag, that move together best.
 
@@ -420,12 +418,10 @@ def _grip(seen: Sightings, hand: HandSightings, turns: Floats, initial: Chain, t
     reach = np.linalg.norm(offsets, axis=1)
     cost = np.where(reach > REACH, np.inf, np.hypot(mean, BESIDE * reach))
     best = int(cost.argmin())
-    trusted = np.sort(apart[:, best])[:max(round(TRUSTED * len(apart)), 1)]
     path = np.full((len(turns), 3), np.nan)
     known = np.isfinite(turns[:, 0]) & np.isfinite(hand.positions[:, 0])
     path[known] = hand.positions[known] + Rotation.from_quat(turns[known]).apply(offsets[best])
-    return _Held(float(places[best]), float(np.median(apart[:, best])),
-                 float(np.sqrt(np.mean(np.square(trusted)))), float(cost[best]), path, turns)
+    return _Motion(float(places[best]), float(np.median(apart[:, best])), float(cost[best]), path, turns)
 
 
 def _own(seen: Sightings, place: float) -> Floats:

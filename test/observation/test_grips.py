@@ -237,3 +237,18 @@ def test_a_hand_that_hides_what_it_grips_has_not_lost_it():
 
         some.append(replace(original, goals=tuple(map(seen, original.goals))))
     assert GripEvidence.of(some).losses == ()
+
+
+def test_a_hand_that_hides_what_it_grips_shows_neither_delay_nor_shift():
+    shown = trial(late=0.1, turn=0.6)
+    at = round(shown.hands[0].grips[0] + shown.hands[0].offset)
+
+    def hidden(goal):
+        points = np.array(goal.chain.points)
+        points[max(at - 1, 0):at + 2] = np.nan
+        return replace(goal, chain=Chain(points))
+    covered = replace(shown, goals=tuple(map(hidden, shown.goals)))
+    assert GripEvidence.of([shown]).delay is not None
+    evidence = GripEvidence.of([covered])
+    assert not evidence.errors
+    assert evidence.delay is None
