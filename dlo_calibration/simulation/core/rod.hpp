@@ -18,10 +18,10 @@
 // length of a segment within a step, T dt^2 / (l m) >= 1, and a share of it with less tension.  The negative
 // part of the matrix of a compressed spring is omitted, so that the whole matrix stays positive definite.
 //
-// A segment that turns by phi in a step is phi^2 / 2 longer after it, which the next step takes back.  Where a
-// DLO is dragged around a peg that is the largest error of a step of 3 ms.  Springs linearised where the last
-// velocities lead, also smoothed ones, halve it, but are unstable: in long steps, and where a rope is pulled
-// taut around a peg, tensions grow without bound.
+// A segment that turns by phi in a step is phi^2 / 2 longer after it, which the next step takes back.  Springs
+// linearised where the last velocities lead, also smoothed ones, take a third of that error away where a DLO
+// is dragged around a peg, but are unstable: in long steps, and where a rope is pulled taut around a peg,
+// tensions grow without bound.
 
 namespace dlo {
 namespace DLO_TARGET {
