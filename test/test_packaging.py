@@ -142,16 +142,19 @@ def test_rosdoc2_finds_its_configuration():
     assert (ROOT / manifest().findtext('export/rosdoc2')).is_file()
 
 
+@pytest.mark.long
 def test_colcon_puts_executables_where_ros2_run_looks(prefix):
     for name in EXECUTABLES:
         assert os.access(prefix / 'lib' / NAME / name, os.X_OK)
 
 
+@pytest.mark.long
 def test_colcon_registers_the_package(prefix):
     assert (prefix / 'share/ament_index/resource_index/packages' / NAME).is_file()
     assert (prefix / 'share' / NAME / 'package.xml').is_file()
 
 
+@pytest.mark.long
 def test_colcon_installs_the_shared_folders(prefix, sources):
     for folder in ('config', 'launch', 'msg_samples'):
         wanted = {file.relative_to(sources) for file in (sources / folder).rglob('*')
@@ -169,6 +172,7 @@ def loaded(folder, tmp_path):
     return Path(done.stdout.strip())
 
 
+@pytest.mark.long
 def test_colcon_compiles_the_core(prefix, tmp_path):
     folder = next(prefix.glob('lib/python*/site-packages'))
     assert loaded(folder, tmp_path).is_relative_to(folder)

@@ -122,10 +122,11 @@ def test_images_of_a_recorded_session_are_a_film(resting, tmp_path, capsys):
 
 
 @pytest.mark.parametrize('arguments, said', [
-    (['--points', '10,10 40,40', '--board'], 'clicks'),
     (['--points', '10,10'], 'two or more'),
-    (['--board', '--at', '100'], '--at'),
-    (['--board', '--held', '20,20'], '--held'),
+    *(pytest.param(*case, marks=pytest.mark.long) for case in (
+        (['--points', '10,10 40,40', '--board'], 'clicks'),
+        (['--board', '--at', '100'], '--at'),
+        (['--board', '--held', '20,20'], '--held'))),
     (['--board', '--held', '20'], '--held'),
     (['--board', '--count', '2'], '--count'),
 ])

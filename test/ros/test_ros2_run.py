@@ -19,6 +19,7 @@ import pytest
 NAME = 'dlo_calibration'
 PATIENCE = 60.0  # s
 
+pytestmark = pytest.mark.long  # colcon builds the package
 index = pytest.importorskip('ament_index_python', reason='needs the ament index, with ROS 2 or from PyPI')
 
 
