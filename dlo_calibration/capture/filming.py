@@ -12,7 +12,8 @@ import numpy as np
 
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.observation.episodes import Episode, episodes, HandSightings, Sightings
+from dlo_calibration.observation.episodes import Episode, episodes
+from dlo_calibration.observation.sightings import HandSightings, Sightings
 from dlo_calibration.vision.observer import ImageView
 from dlo_calibration.vision.tags import tag_path, TagPose
 

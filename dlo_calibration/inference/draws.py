@@ -9,7 +9,7 @@ from statistics import NormalDist
 
 import numpy as np
 
-from dlo_calibration.inference.uncertainty import Uncertainty, UNKNOWN_STD
+from dlo_calibration.inference.uncertainty import Uncertainty
 from dlo_calibration.model.chain import Floats
 
 EDGE = 0.05  # from the ends of the scale, where no draw lies
@@ -25,10 +25,6 @@ def drawn_points(point: Floats, uncertainty: Uncertainty, count: int, seed: int)
     generator = np.random.default_rng(seed)
     shares = (np.argsort(generator.random((count, len(point))), axis=0) + 0.5) / count
     normal = np.vectorize(NormalDist().inv_cdf)(shares)
-    covariance = uncertainty.covariance
-    if covariance is None:
-        covariance = np.diag(uncertainty.std**2)
-    values, axes = np.linalg.eigh(covariance)
+    values, axes = np.linalg.eigh(uncertainty.spread)
     drawn = point + normal @ (axes * np.sqrt(np.maximum(values, 0.0))).T
-    unknown = uncertainty.std > 0.95 * UNKNOWN_STD
-    return np.clip(np.where(unknown, shares, drawn), EDGE, 1 - EDGE)
+    return np.clip(np.where(uncertainty.unknown, shares, drawn), EDGE, 1 - EDGE)

@@ -109,9 +109,7 @@ class Expectation:
         :param trust: (d,) how much of what linear models promised was found so far, for each parameter.
         :raises CancelledError: when stopped.
         """
-        count, covariance = len(points), uncertainty.covariance
-        if covariance is None:
-            covariance = np.diag(uncertainty.std**2)
+        count = len(points)
         shown = excites(trials, space, np.inf) if trials else np.zeros((0, space.dimension), np.bool_)
         dimension = space.dimension
         told = np.array([np.full((dimension, dimension), np.nan) if changes is None else
@@ -121,7 +119,7 @@ class Expectation:
         failed = np.isnan(told[..., 0, 0]).mean(axis=1) > FAILURES
         told[failed] = np.nan
         told[~failed] = np.nan_to_num(told[~failed])  # a draw with which the action fails tells nothing
-        return cls(told, np.asarray(np.linalg.inv(covariance), float), wanted)
+        return cls(told, np.asarray(np.linalg.inv(uncertainty.spread), float), wanted)
 
     @property
     def possible(self) -> NDArray[np.bool_]:
@@ -157,10 +155,8 @@ class Expectation:
         """
         told = self.informations[self.possible]
         so_far = np.zeros(self.informations.shape[1:])
-        best = self.deviations(so_far).mean(axis=0)
-        for count in range(MOST_TRIALS + 1):
-            best = self.deviations(so_far).mean(axis=0)
-            if (best <= REACHED * self.wanted).all() or not len(told) or count == MOST_TRIALS:
-                return count, best
+        count, best = 0, self.deviations(so_far).mean(axis=0)
+        while count < MOST_TRIALS and len(told) and (best > REACHED * self.wanted).any():
             so_far = so_far + told[int(self.distances(so_far + told).mean(axis=1).argmin())]
-        return MOST_TRIALS, best
+            count, best = count + 1, self.deviations(so_far).mean(axis=0)
+        return count, best

@@ -42,8 +42,8 @@ def read_targets(text: str) -> Mapping[str, float]:
         if match[3] and parameter.linear:
             raise InputError(THING, f'{part.strip()}', f'a half width of {name} on the 0..100 scale, as its '
                              'physical value may be 0', 'leave the % out')
-        decades = 1.0 if parameter.linear else abs(math.log(parameter.at_hundred / parameter.at_zero))
-        targets[name] = math.log1p(number / 100) / decades if match[3] else number / SCALE
+        scale = abs(math.log(parameter.at_hundred / parameter.at_zero)) if match[3] else SCALE
+        targets[name] = (math.log1p(number / 100) if match[3] else number) / scale
     return targets
 
 

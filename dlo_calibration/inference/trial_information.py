@@ -35,6 +35,7 @@ from dlo_calibration.inference.examination import Examination, extended
 from dlo_calibration.inference.outlier import candidate, is_outlier, SOMETHING_ELSE
 from dlo_calibration.inference.uncertainty import (
     at_minimum,
+    HARDLY,
     IDENTIFIABLE,
     NOT_IDENTIFIABLE,
     optimum_shift,
@@ -162,12 +163,12 @@ def uninformative(trials: Sequence[Trial], examination: Examination | None) -> t
     """
     Return the names of the calibrated trials that inform about no parameter; () if that is unknown.
 
-    Each of them alone would leave every standard deviation above 95 % of that of the prior.
+    Each of them alone would leave every standard deviation above HARDLY of that of the prior.
     """
     if examination is None or not examination.regular:
         return ()
     return tuple(trial.name for trial, std in zip(trials, std_of_each_alone(trials, examination), strict=True)
-                 if (std > 0.95 * UNKNOWN_STD).all())
+                 if (std > HARDLY * UNKNOWN_STD).all())
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,6 +34,7 @@ from dlo_calibration.evaluation.residuals import Huber, ResidualLayout
 from dlo_calibration.model.chain import Floats, frozen_array
 
 UNKNOWN_STD = 1 / np.sqrt(12)  # of the uniform distribution on 0..1, which is the prior
+HARDLY = 0.95  # of UNKNOWN_STD; trials that leave more inform about nothing
 # Widths of a 90 % interval, in the unit cube.  At the ends of the first, simulated points of the reference
 # objects move by 4 % of the length (bending stiffness) and 2 % (friction), on average over nine actions; at
 # the ends of the second by 7 and 4 %, which is most of the 10 and 6 % that a value from far away costs.
@@ -88,6 +89,16 @@ class Uncertainty:
     def verdicts(self) -> tuple[str, ...]:
         """The verdict on each parameter."""
         return tuple(map(verdict, self.lower.tolist(), self.upper.tolist()))
+
+    @property
+    def spread(self) -> Floats:
+        """The covariance, (d, d); without correlations where only the standard deviations are known."""
+        return np.diag(self.std**2) if self.covariance is None else self.covariance
+
+    @property
+    def unknown(self) -> NDArray[np.bool_]:
+        """Which parameters, (d,), are hardly better known than without any trial."""
+        return np.asarray(self.std > HARDLY * UNKNOWN_STD)
 
     def of_excited(self, excited: NDArray[np.bool_]) -> Uncertainty:
         """Return the uncertainty with unknown parameters where `excited`, (d,), is False."""

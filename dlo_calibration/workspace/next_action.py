@@ -22,7 +22,7 @@ from dlo_calibration.evaluation.pool import Pool, Threads
 from dlo_calibration.inference.draws import drawn_points
 from dlo_calibration.inference.expectation import Expectation, MOST_TRIALS, REACHED
 from dlo_calibration.inference.target import wanted_deviations
-from dlo_calibration.inference.uncertainty import DEVIATIONS, UNKNOWN_STD
+from dlo_calibration.inference.uncertainty import DEVIATIONS
 from dlo_calibration.model.action import Action
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.parameters import SCALE
@@ -44,8 +44,7 @@ MODEL_ERROR = 5e-3  # share of the length by which a simulation with the right p
 LEAST_TRUST = 0.1  # in derivatives, where trials gave only a bound, wider than a linear model says
 LEAST_TRIALS = 2  # one alone does not show what differs from trial to trial, such as errors of grips
 TOLD_AFTER = 2  # trials after which a parameter that no action shows is given up
-STILL_UNKNOWN = 0.95  # of the standard deviation before any trial
-CLEAR = 0.25  # of it that a single action must leave at most
+CLEAR = 0.25  # of a standard deviation that a single action must leave at most
 SHOWN = 0.5  # of a standard deviation that all foreseen trials leave: if they leave more, none shows it
 
 
@@ -195,7 +194,7 @@ class _Seeker:
             far &= then > SHOWN * nothing.std
         # What earlier trials left unknown, though they promised to show some of it, needs a clear view.
         single = expectation.deviations(expectation.informations[expectation.possible]).mean(axis=1)
-        far |= (nothing.std > np.maximum(wanted, STILL_UNKNOWN * UNKNOWN_STD)) & (
+        far |= self._uncertainty.unknown & (nothing.std > wanted) & (
             single.min(axis=0, initial=np.inf) > CLEAR * nothing.std)
         if self._count >= TOLD_AFTER and far.any():
             wanted = np.where(far, np.inf, wanted)

@@ -9,7 +9,8 @@ from filmed_hands import CLOSES, COUNT, filmed_hand, OPENS, RADIUS
 import numpy as np
 import pytest
 
-from dlo_calibration.observation.episodes import episodes, HandSightings, Sightings
+from dlo_calibration.observation.episodes import episodes
+from dlo_calibration.observation.sightings import HandSightings, Sightings
 
 
 def joined(*films):

@@ -6,7 +6,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dlo_calibration.observation.episodes import HandSightings, Sightings
+from dlo_calibration.observation.sightings import HandSightings, Sightings
 
 RATE, COUNT, RADIUS = 30.0, 41, 0.004
 CAMERA = np.array([0.3, -0.5, 0.8])
