@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 import sys
 from types import MappingProxyType
-from typing import Any, Iterable, Mapping, Sequence
+from typing import Any, Callable, Iterable, Mapping, Sequence
 
 from dlo_calibration.errors import InputError, suggestion
 
@@ -25,8 +25,6 @@ def node_and_rviz(file: str, node: str, *, parameters: Mapping[str, str], topics
     :raises InputError: for an unknown argument, or where RViz is wanted and not installed.
     """
     from ament_index_python.packages import get_package_share_directory
-    from launch import LaunchDescription
-    from launch.actions import DeclareLaunchArgument, OpaqueFunction
     from launch.conditions import IfCondition
     from launch.substitutions import LaunchConfiguration
     from launch_ros.actions import Node
@@ -40,11 +38,8 @@ def node_and_rviz(file: str, node: str, *, parameters: Mapping[str, str], topics
         **{name: ('', f"{words}; empty: the node's own") for name, words in topics.items()},
         'frame': ('world', 'frame_id of the chains, which RViz shows'),
     }
-    check_arguments(file, (*arguments, 'rviz'))
-
     def start(context: Any) -> list[Any]:
-        value = {name: LaunchConfiguration(name).perform(context) for name in (*arguments, 'rviz')}
-        check_rviz(value['rviz'])
+        value = {name: LaunchConfiguration(name).perform(context) for name in arguments}
         given = {name: value[name] for name in topics}
         return [
             Node(package='dlo_calibration', executable=node, name=node, output='screen',
@@ -58,13 +53,7 @@ def node_and_rviz(file: str, node: str, *, parameters: Mapping[str, str], topics
                  condition=IfCondition(LaunchConfiguration('rviz'))),
         ]
 
-    return LaunchDescription([
-        *(DeclareLaunchArgument(name, default_value=default, description=description)
-          for name, (default, description) in arguments.items()),
-        DeclareLaunchArgument('rviz', default_value='false', choices=['true', 'false'],
-                              description='start RViz too (the package rviz2)'),
-        OpaqueFunction(function=start),  # an argument that is empty is left out, which needs its value
-    ])
+    return _described(file, arguments, start)
 
 
 #: Topic of the calibrator -> topic of the tracker, of what a camera sees of trials.
@@ -80,8 +69,6 @@ def tracker_and_calibrator(file: str, parameters: Mapping[str, str] = MappingPro
     :raises InputError: for an unknown argument, or where RViz is wanted and not installed.
     """
     from ament_index_python.packages import get_package_share_directory
-    from launch import LaunchDescription
-    from launch.actions import DeclareLaunchArgument, OpaqueFunction
     from launch.conditions import IfCondition
     from launch.substitutions import LaunchConfiguration
     from launch_ros.actions import Node
@@ -99,11 +86,8 @@ def tracker_and_calibrator(file: str, parameters: Mapping[str, str] = MappingPro
         **{name: ('', f'{words}; empty: as the parameter file says') for name, words in parameters.items()},
         'frame': ('table', 'frame_id of the chains'),
     }
-    check_arguments(file, (*arguments, 'rviz'))
-
     def start(context: Any) -> list[Any]:
-        value = {name: LaunchConfiguration(name).perform(context) for name in (*arguments, 'rviz')}
-        check_rviz(value['rviz'])
+        value = {name: LaunchConfiguration(name).perform(context) for name in arguments}
         topics = {'image': value['image'], 'image/compressed': value['compressed'],
                   'camera_info': value['camera_info'], 'depth': value['depth']}
         return [
@@ -119,12 +103,31 @@ def tracker_and_calibrator(file: str, parameters: Mapping[str, str] = MappingPro
                  condition=IfCondition(LaunchConfiguration('rviz'))),
         ]
 
+    return _described(file, arguments, start)
+
+
+def _described(file: str, arguments: Mapping[str, tuple[str, str]], start: Callable[[Any], list[Any]]) -> Any:
+    """
+    Return a LaunchDescription with arguments, each with its default and its words, and RViz if wanted.
+
+    :param start: returns what to start; an argument that is empty is left out, which needs its value.
+    """
+    from launch import LaunchDescription
+    from launch.actions import DeclareLaunchArgument, OpaqueFunction
+    from launch.substitutions import LaunchConfiguration
+
+    check_arguments(file, (*arguments, 'rviz'))
+
+    def checked(context: Any) -> list[Any]:
+        check_rviz(LaunchConfiguration('rviz').perform(context))
+        return start(context)
+
     return LaunchDescription([
         *(DeclareLaunchArgument(name, default_value=default, description=description)
           for name, (default, description) in arguments.items()),
         DeclareLaunchArgument('rviz', default_value='false', choices=['true', 'false'],
                               description='start RViz too (the package rviz2)'),
-        OpaqueFunction(function=start),
+        OpaqueFunction(function=checked),
     ])
 
 
