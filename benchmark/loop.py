@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from dlo_calibration import calibrate, Options
-from dlo_calibration.capture.hanging import hanging_chain, hanging_trial, NODES, straight_down, with_ends
+from dlo_calibration.capture.hanging import COUNT, hanging_dlo, hanging_trial, NODES, straight_down, with_ends
 from dlo_calibration.vision.middle_line import along_line, arc_lengths
 from dlo_calibration.vision.photograph import read_photograph
 from dlo_calibration.vision.pose import scale_from_length
@@ -72,10 +72,10 @@ def evenly(line: Floats) -> Floats:
 def stiffness(trace: Trace, size: tuple[int, int], in_clamps: bool = True) -> tuple[float, float, float]:
     """Return EI from a line, with the bounds of its interval [N m^2]."""
     scale = scale_from_length(trace.pixels, LENGTH, size)
-    chain = hanging_chain(trace, scale, straight_down(scale, trace.pixels), 41,
-                          clamps=CLAMPS if in_clamps else None)
+    hangs = hanging_dlo(trace, scale, straight_down(scale, trace.pixels), COUNT,
+                        clamps=CLAMPS if in_clamps else None)
     options = Options.of({'mass': with_ends(MASS), 'nodes': NODES})
-    result = calibrate([hanging_trial('trial 1', chain)], options)
+    result = calibrate([hanging_trial('trial 1', hangs.chain)], options)
     found = result.parameters['flexibility']
     return found.physical_value, found.physical_lower, found.physical_upper
 

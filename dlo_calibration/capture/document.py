@@ -39,6 +39,10 @@ def _pixel(entry: JsonValue) -> Pixel:
     return entry.numbers(2, -LARGEST_PIXEL, LARGEST_PIXEL)
 
 
+def _size(entry: JsonValue) -> float | None:
+    return entry.number(1e-3, LARGEST_PLACE) if entry.given else None
+
+
 def _id(entry: JsonValue) -> str:
     if not ID.fullmatch(entry.text(NAME_LENGTH)):
         raise entry.refused(repr(entry.value), 'an id of 8 letters a to z and digits')
@@ -116,8 +120,26 @@ class SameScale:
     photograph: str = entry_field(_id)
 
 
-ScaleEntry = Union[BoardScale, PointsScale, SameScale]
-SCALES: Mapping[str, type[ScaleEntry]] = {'board': BoardScale, 'points': PointsScale, 'same': SameScale}
+@dataclass(frozen=True)
+class HangingScale:
+    """
+    The DLO hangs between two clamps before the camera, which looks squarely at it: a trial by itself.
+
+    :param length: of the DLO from clamp to clamp [m]; None: `gap` counts.
+    :param gap: distance between the places where the DLO leaves the clamps [m].
+    :param clamps: a pixel in each clamp, on the middle of the DLO, that of the first click first; fewer: the
+        DLO's own direction counts.
+    """
+
+    kind: str = _kind('hanging')
+    length: float | None = entry_field(_size, None)
+    gap: float | None = entry_field(_size, None)
+    clamps: tuple[Pixel, ...] = entry_field(_each('clamp', 2, _pixel), ())
+
+
+ScaleEntry = Union[BoardScale, PointsScale, SameScale, HangingScale]
+SCALES: Mapping[str, type[ScaleEntry]] = {
+    'board': BoardScale, 'points': PointsScale, 'same': SameScale, 'hanging': HangingScale}
 
 
 def _scale(entry: JsonValue) -> ScaleEntry | None:
@@ -286,16 +308,24 @@ class Document:
         """Return the document as plain values, with all defaults."""
         return dict(plain(self))
 
+    def hangs(self, photograph: str) -> bool:
+        """Tell whether a photograph, given by its id, shows a DLO that hangs between clamps."""
+        return isinstance(self.by_id[photograph].scale, HangingScale)
+
     def with_photograph(self, entry: PhotographEntry) -> Document:
         """
         Return the document with one more photograph, which is also given a place in a trial.
 
         It becomes the goal of the last trial if that has none; else the goal of a new trial, which starts at
-        the last goal.  The very first photograph becomes the start of the first trial.
+        the last goal.  The very first photograph becomes the start of the first trial.  Where the DLO of the
+        last trial hangs, it hangs in this photograph, too.
         """
         trials = self.trials
         if not trials:
             trials = (TrialEntry(entry.id),)
+        elif isinstance(hanging := self.by_id[trials[-1].start].scale, HangingScale):
+            entry = replace(entry, scale=replace(hanging, clamps=()))
+            trials = (*trials, TrialEntry(entry.id))[:MOST_TRIALS]
         elif trials[-1].goal is None:
             trials = (*trials[:-1], replace(trials[-1], goal=entry.id))
         elif len(trials) < MOST_TRIALS:
@@ -324,3 +354,5 @@ class Document:
                                'one of them with a board or points')
             photograph = self.by_id[photograph.scale.photograph]
             seen.add(photograph.id)
+        if len(seen) > 1 and isinstance(photograph.scale, HangingScale):
+            raise _refused(f'{where}, scale', 'the same as that of a DLO that hangs', 'a scale of its own')

@@ -10,6 +10,7 @@ the simulated DLO comes to rest from there.  Its frame has x to the right, z up,
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
@@ -32,7 +33,21 @@ FEWEST = 10  # points that determine it
 ABOVE_TABLE = 1.0  # m, height of the lowest point, so that no table touches it
 #: Of a simulated DLO: it bends most beside its clamps, where a coarser one is stiffer than the real one is.
 NODES = 121
+COUNT = 41  # points of a chain, four of which are in the clamps
 REST = 5.0  # s after which the simulated DLO is looked at
+
+
+@dataclass(frozen=True, eq=False)
+class HangingDlo:
+    """
+    A DLO that hangs between two clamps.
+
+    :param chain: begins and ends inside the clamps: its first two and its last two points are in them.
+    :param scale: of the photograph, in the frame of the chain.
+    """
+
+    chain: Chain
+    scale: Scale
 
 
 def straight_down(scale: Scale, line: Floats, plumb: ArrayLike | None = None) -> Floats:
@@ -53,15 +68,13 @@ def straight_down(scale: Scale, line: Floats, plumb: ArrayLike | None = None) ->
     return np.asarray((lower - upper) / size)
 
 
-def hanging_chain(trace: Trace, scale: Scale, down: Floats, count: int, away: float = 0.0,
-                  clamps: ArrayLike | None = None) -> Chain:
+def hanging_dlo(trace: Trace, scale: Scale, down: Floats, count: int, away: float = 0.0,
+                clamps: ArrayLike | None = None) -> HangingDlo:
     """
-    Return the chain of a DLO that hangs between two clamps, which begins and ends inside them.
-
-    Its first two and its last two points are in the clamps.
+    Return the DLO that a photograph shows between two clamps.
 
     :param down: (2,) unit vector in the plane of the scale, straight down.
-    :param count: of points.
+    :param count: of points of the chain.
     :param away: distance of the DLO's middle from the plane of the scale [m].
     :param clamps: (2, 2) a pixel in each clamp, on the DLO's middle; None: the DLO's own direction counts.
     """
@@ -83,12 +96,17 @@ def hanging_chain(trace: Trace, scale: Scale, down: Floats, count: int, away: fl
         ends.append(mouth + IN_CLAMP * along[-1] * into / size)
     flat = np.concatenate([ends[:1], along_line(line, along, np.linspace(0.0, along[-1], count - 2)),
                            ends[1:]])
-    flat -= [line[0, 0], line[:, 1].min() - ABOVE_TABLE]
-    return Chain(np.column_stack([flat[:, 0], np.zeros(count), flat[:, 1]]))
+    origin = np.array([line[0, 0], line[:, 1].min() - ABOVE_TABLE])
+    flat -= origin
+    chain = Chain(np.column_stack([flat[:, 0], np.zeros(count), flat[:, 1]]))
+    right, up = np.column_stack([turn, np.zeros(2)])
+    return HangingDlo(chain, replace(
+        scale, rotation=scale.rotation @ np.column_stack([right, np.cross(up, right), up]),
+        translation=scale.rotation @ [*(origin @ turn), away] + scale.translation))
 
 
 def hanging_trial(name: str, chain: Chain) -> Trial:
-    """Return the trial of a chain that hangs at rest between clamps, as `hanging_chain` makes it."""
+    """Return the trial of a chain that hangs at rest between clamps, as `hanging_dlo` makes it."""
     last = len(chain) - 1
     times = np.array([0.0, 1.0])
     hands = tuple(Hand(clamp, grips, times, np.repeat(chain.points[place][None], 2, axis=0))

@@ -11,7 +11,14 @@ from typing import Any, Callable, Hashable, Mapping, Sequence, TypeVar, Union
 
 import numpy as np
 
-from dlo_calibration.capture.document import BoardScale, Document, PhotographEntry, PointsScale
+from dlo_calibration.capture.document import (
+    BoardScale,
+    Document,
+    HangingScale,
+    PhotographEntry,
+    PointsScale,
+)
+from dlo_calibration.capture.hanging import COUNT, hanging_dlo, HangingDlo, straight_down
 from dlo_calibration.capture.project import Project
 from dlo_calibration.errors import DEFECT, InputError
 from dlo_calibration.model.chain import Chain, Floats
@@ -19,7 +26,8 @@ from dlo_calibration.vision.axis import Axis, axis_of, measured_diameter
 from dlo_calibration.vision.board import find_board
 from dlo_calibration.vision.lens import Lens
 from dlo_calibration.vision.middle_line import along_line, arc_lengths
-from dlo_calibration.vision.pose import scale_from_points
+from dlo_calibration.vision.photograph import Photograph
+from dlo_calibration.vision.pose import scale_from_length, scale_from_points
 from dlo_calibration.vision.scale import grid, Scale
 from dlo_calibration.vision.tracer import Trace, Tracer
 
@@ -42,6 +50,7 @@ class Measurement:
     :param diameter: of the DLO, measured in this photograph [m]; `thickness`: the one used for all [m].
     :param axis: of the DLO, if it lies on the table; `axis_problem`: why it has none.
     :param count: number of points of the chain.
+    :param hanging: the DLO, if it hangs between clamps.
     """
 
     entry: PhotographEntry
@@ -59,6 +68,12 @@ class Measurement:
     axis: Axis | None = None
     axis_problem: str | None = None
     count: int = 21
+    hanging: HangingDlo | None = None
+
+    @property
+    def trial_scale(self) -> Scale | None:
+        """The scale in the frame of the photograph's trial."""
+        return self.scale if self.hanging is None else self.hanging.scale
 
     @cached_property
     def chain(self) -> Chain | None:
@@ -90,13 +105,21 @@ class Measurement:
                       'answered': k in self.answered, 'suggested': crossing.first_above}
                      for k, crossing in enumerate(trace.crossings)]
         chain = None
-        if axis is not None:
+        if self.hanging is not None:
+            chain = numbers(self.hanging.scale.to_pixels(self.hanging.chain.points[1:-1]))
+        elif axis is not None:
             along = arc_lengths(trace.pixels)
             places = np.interp(np.linspace(0.0, axis.length, self.count), axis.along, along)
             chain = numbers(along_line(trace.pixels, along, places))
         return {'pixels': numbers(trace.pixels), 'sure': trace.sure.tolist(), 'width': trace.width,
-                'crossings': crossings, 'length': None if axis is None else axis.length,
+                'crossings': crossings, 'length': self._length,
                 'diameter': self.diameter, 'chain': chain}
+
+    @property
+    def _length(self) -> float | None:
+        if self.hanging is not None:
+            return float(arc_lengths(self.hanging.chain.points[1:-1])[-1])
+        return None if self.axis is None else self.axis.length
 
 
 def _lattice(scale: Scale) -> dict[str, Any]:
@@ -154,6 +177,8 @@ class Measurer:
         if isinstance(size, InputError):
             return Measurement(entry, problem=str(size))
         measurement = Measurement(entry, size, count=self._document.dlo.points)
+        if isinstance(entry.scale, HangingScale):
+            return self._hanging(measurement, entry.scale)
         owner = self._document.scale_of(entry)
         marked = self._scale(owner, entry, size)
         if isinstance(marked, InputError):
@@ -174,6 +199,36 @@ class Measurer:
                 measured_diameter, trace, measurement.scale))
         return replace(measurement, trace=trace, above=above, answered=answered,
                        diameter=None if isinstance(diameter, InputError) else diameter)
+
+    def _hanging(self, measurement: Measurement, given: HangingScale) -> Measurement:
+        """Return the measurement of a photograph of a DLO that hangs; its line gives the scale."""
+        entry = measurement.entry
+        if len(entry.clicks) < 2:
+            return measurement
+        trace = self._attempt('trace', entry.id, (entry.clicks, given.kind), lambda: (
+            self.tracer(entry.id).trace(np.array(entry.clicks), clamped=True)))
+        if isinstance(trace, InputError):
+            return replace(measurement, trace_problem=str(trace))
+        measurement = replace(measurement, trace=trace)
+        if given.length is None and given.gap is None:
+            return measurement
+        lens = self._project.lens
+        measured = self._attempt('scale', entry.id, (trace, given, lens), partial(
+            self._hung, trace, given, lens, self._project.photograph(entry.id)))
+        if isinstance(measured, InputError):
+            return replace(measurement, scale_problem=str(measured))
+        scale, diameter, hanging = measured
+        return replace(measurement, scale=scale, diameter=diameter, hanging=hanging)
+
+    def _hung(self, trace: Trace, given: HangingScale, lens: Lens | None, photograph: Photograph
+              ) -> tuple[Scale, float, HangingDlo]:
+        """Return the scale of a DLO that hangs, its diameter [m], and the DLO."""
+        line = trace.pixels[[0, -1]] if given.length is None else trace.pixels
+        scale = scale_from_length(line, given.length or given.gap or 0.0, photograph.size, lens,
+                                  photograph.focal_length)
+        clamps = np.array(given.clamps) if len(given.clamps) == 2 else None
+        hanging = hanging_dlo(trace, scale, straight_down(scale, trace.pixels), COUNT, clamps=clamps)
+        return scale, measured_diameter(trace, scale), hanging
 
     def _scale(self, owner: PhotographEntry, entry: PhotographEntry,
                size: tuple[int, int]) -> Union[tuple[Scale, Floats], InputError, None]:
@@ -201,7 +256,8 @@ class Measurer:
         """Return a measurement with the axis; the same object until something changes."""
         trace, scale, photograph = measurement.trace, measurement.scale, measurement.entry.id
         axis: Union[Axis, InputError, None] = None
-        if trace is not None and scale is not None and diameter is not None:
+        lies = measurement.hanging is None
+        if lies and trace is not None and scale is not None and diameter is not None:
             key = trace, scale, diameter, measurement.count, tuple(sorted(measurement.above.items()))
             axis = self._attempt('axis', photograph, key, lambda: axis_of(
                 trace, scale, diameter, measurement.count, measurement.above))

@@ -10,7 +10,7 @@ from typing import Sequence
 
 import numpy as np
 
-from dlo_calibration.capture.document import SameScale, TrialEntry
+from dlo_calibration.capture.document import HangingScale, SameScale, TrialEntry
 from dlo_calibration.capture.hands import Hold, Movements
 from dlo_calibration.capture.measurement import Measurement
 from dlo_calibration.model.chain import Chain, Floats
@@ -68,35 +68,37 @@ def check_photograph(warnings: TrialWarnings, photograph: Measurement, which: st
     """
     Warn of missing and doubtful things in a photograph.
 
-    :param which: photograph of the trial, e.g. `start`.
+    :param which: photograph of the trial, e.g. `start photograph`.
     :param on_table: whether the whole DLO lies on the table in it.
     """
     if photograph.problem is not None:
-        warnings.error(f'The {which} photograph cannot be read: {photograph.problem}')
+        warnings.error(f'The {which} cannot be read: {photograph.problem}')
         return
     if photograph.scale_problem is not None:
-        warnings.error(f'The {which} photograph has no scale: {photograph.scale_problem}', 'set_scale')
+        warnings.error(f'The {which} has no scale: {photograph.scale_problem}', 'set_scale')
     elif photograph.scale is None:
-        warnings.error(f'The {which} photograph has no scale yet: lay the printed board beside the DLO, or '
-                       'mark four known points.', 'set_scale')
+        remedy = 'say how long the DLO is from clamp to clamp, or how far apart the clamps are' if (
+            isinstance(photograph.entry.scale, HangingScale)) else (
+            'lay the printed board beside the DLO, or mark four known points')
+        warnings.error(f'The {which} has no scale yet: {remedy}.', 'set_scale')
     trace = photograph.trace
     if photograph.trace_problem is not None:
-        warnings.error(f'The line in the {which} photograph: {photograph.trace_problem}', 'add_click')
+        warnings.error(f'The line in the {which}: {photograph.trace_problem}', 'add_click')
     elif trace is None:
-        warnings.error(f'Click along the DLO in the {which} photograph, from one end to the other.',
+        warnings.error(f'Click along the DLO in the {which}, from one end to the other.',
                        'add_click')
     if trace is None:
         return
     count = len(trace.crossings) - len(photograph.answered)
     if on_table and count:
         where = 'a crossing' if count == 1 else f'{count} crossings'
-        warnings.warning(f'Say which strand is above at {where} in the {which} photograph; until then it is '
+        warnings.warning(f'Say which strand is above at {where} in the {which}; until then it is '
                          'guessed.', 'ask_crossings')
     if on_table and photograph.axis_problem is not None:
-        warnings.error(f'The line in the {which} photograph: {photograph.axis_problem}', 'set_scale')
+        warnings.error(f'The line in the {which}: {photograph.axis_problem}', 'set_scale')
     unsure = 1.0 - float(trace.sure.mean())
     if unsure > UNSURE:
-        warnings.warning(f'The line in the {which} photograph is not sure along {100 * unsure:.0f} % of its '
+        warnings.warning(f'The line in the {which} is not sure along {100 * unsure:.0f} % of its '
                          'length: check it, and add a click there.', 'add_click')
 
 

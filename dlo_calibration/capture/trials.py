@@ -17,8 +17,9 @@ from typing import Any, Mapping, Sequence
 import numpy as np
 
 from dlo_calibration.calibration.options import FileOptions, Options, recordable
-from dlo_calibration.capture.document import TrialEntry
+from dlo_calibration.capture.document import HangingScale, TrialEntry
 from dlo_calibration.capture.hands import held_after, Hold, move, Movements, PAUSE
+from dlo_calibration.capture.hanging import hanging_trial, NODES, with_ends
 from dlo_calibration.capture.json_values import plain
 from dlo_calibration.capture.measurement import Measurement, Measurer, numbers
 from dlo_calibration.capture.obstacles import lines_around, place_obstacles, PlacedObstacle, seen_lines
@@ -32,7 +33,7 @@ from dlo_calibration.files.request import write_request as write_document
 from dlo_calibration.files.session import trial_records
 from dlo_calibration.messages.collector import TrialCollector
 from dlo_calibration.messages.encoder import trial_messages
-from dlo_calibration.model.chain import Chain, Floats
+from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import BY_NAME, SCALE
 from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.simulation.nodes import spread_places
@@ -50,6 +51,7 @@ class TrialDraft:
 
     :param trial: as a session records it; None: it is incomplete or wrong.
     :param movements: of the hands; None: unknown.
+    :param hangs: between two clamps.
     """
 
     warnings: TrialWarnings
@@ -57,6 +59,7 @@ class TrialDraft:
     goal: Measurement | None = None
     movements: Movements | None = None
     trial: Trial | None = None
+    hangs: bool = False
 
     @cached_property
     def plain(self) -> dict[str, Any]:
@@ -84,6 +87,8 @@ def draft_trial(number: int, entry: TrialEntry, photographs: Mapping[str, Measur
     :param held: the hands that hold the DLO at the start.
     """
     warnings = TrialWarnings()
+    if isinstance(photographs[entry.start].entry.scale, HangingScale):
+        return _hanging_draft(number, photographs[entry.start], warnings)
     begin, start = _axis('start', entry.start, entry.start_side, photographs, warnings)
     end, goal = _axis('goal', entry.goal, entry.goal_side, photographs, warnings)
     if not entry.steps:
@@ -108,8 +113,24 @@ def draft_trial(number: int, entry: TrialEntry, photographs: Mapping[str, Measur
         warnings.error(f'The steps of the hands contradict each other: {refusal}')
         return draft
     check_hands(warnings, movements, chains, radius, entry, held)
-    trial = None if warnings.has_errors else _recorded(f'trial {number}', chains, movements, warnings)
+    if warnings.has_errors:
+        return replace(draft, movements=movements)
+    try:
+        stable = Goal(chains[1], movements.end + PAUSE, True, movements.held_by)
+        trial = _recorded(Trial(f'trial {number}', chains[0], movements.actions, (stable,)), warnings)
+    except InputError as refusal:
+        warnings.error(str(refusal))
+        trial = None
     return replace(draft, movements=movements, trial=trial)
+
+
+def _hanging_draft(number: int, photograph: Measurement, warnings: TrialWarnings) -> TrialDraft:
+    """Return the trial of a photograph of a DLO that hangs."""
+    check_photograph(warnings, photograph, 'photograph', on_table=False)
+    hanging = photograph.hanging
+    trial = None if warnings.has_errors or hanging is None else _recorded(
+        hanging_trial(f'trial {number}', hanging.chain), warnings)
+    return TrialDraft(warnings, photograph, trial=trial, hangs=True)
 
 
 def _axis(which: str, photograph: str | None, side: str | None, photographs: Mapping[str, Measurement],
@@ -125,11 +146,11 @@ def _axis(which: str, photograph: str | None, side: str | None, photographs: Map
         warnings.error('Add a photograph of the DLO after the movement.', 'add_goal')
         return None, None
     above = photographs[photograph]
-    check_photograph(warnings, above, which, side is None)
+    check_photograph(warnings, above, f'{which} photograph', side is None)
     if side is None:
         return above, above.axis
     second = photographs[side]
-    check_photograph(warnings, second, f'second {which}', False)
+    check_photograph(warnings, second, f'second {which} photograph', False)
     if above.thickness is None or above.trace is None or above.scale is None or second.trace is None or (
             second.scale is None):
         return above, None
@@ -152,16 +173,13 @@ def _shares(entry: TrialEntry, held: Sequence[Hold], count: int) -> Floats:
     return spread_places(np.sort(np.array(fixed)), count)
 
 
-def _recorded(name: str, chains: tuple[Chain, Chain], movements: Movements,
-              warnings: TrialWarnings) -> Trial | None:
+def _recorded(trial: Trial, warnings: TrialWarnings) -> Trial | None:
     """
-    Return the trial as read from a recorded session of it.
+    Return a trial as read from a recorded session of it; None, and a warning, where that cannot be.
 
     The page thus calibrates with exactly the numbers of the session.
     """
     try:
-        trial = Trial(name, chains[0], movements.actions,
-                      (Goal(chains[1], movements.end + PAUSE, True, movements.held_by),))
         collector = TrialCollector(Options())
         for message in trial_messages((trial,), 'world'):
             collector.add(message)
@@ -173,7 +191,7 @@ def _recorded(name: str, chains: tuple[Chain, Chain], movements: Movements,
         warnings.error('A session cannot record this order of steps: take a photograph between the '
                        'movements, and make each a trial of its own.')
         return None
-    return replace(trials[0], name=name)
+    return replace(trials[0], name=trial.name)
 
 
 def _same(recorded: Trial, trial: Trial) -> bool:
@@ -227,7 +245,9 @@ class Drafts:
     @property
     def options(self) -> dict[str, Any]:
         """The options of these trials, by name."""
-        return measured_options(self.diameter, self.mass)
+        hang = [draft.hangs for draft in self.trials]
+        options = measured_options(self.diameter, with_ends(self.mass) if hang and all(hang) else self.mass)
+        return {**options, 'nodes': NODES} if any(hang) else options
 
     def plain(self) -> dict[str, Any]:
         """Return the drafts as plain values, for the page."""

@@ -17,7 +17,17 @@ import numpy as np
 
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.capture.hanging import hanging_chain, hanging_trial, NODES, straight_down, with_ends
+from dlo_calibration.capture.hanging import (
+    COUNT as HANGING_COUNT,
+)
+from dlo_calibration.capture.hanging import (
+    hanging_dlo,
+    hanging_trial,
+    HangingDlo,
+    NODES,
+    straight_down,
+    with_ends,
+)
 from dlo_calibration.capture.trials import write_session
 from dlo_calibration.cli.output import print_json, standard_output
 from dlo_calibration.errors import InputError
@@ -27,7 +37,7 @@ from dlo_calibration.model.parameters import BY_NAME, SCALE
 from dlo_calibration.vision.axis import axis_of, measured_diameter
 from dlo_calibration.vision.board import find_board
 from dlo_calibration.vision.lens import read_lens
-from dlo_calibration.vision.middle_line import along_line, arc_lengths
+from dlo_calibration.vision.middle_line import arc_lengths
 from dlo_calibration.vision.photograph import Photograph, read_photograph
 from dlo_calibration.vision.pose import scale_from_length, scale_from_points
 from dlo_calibration.vision.scale import Scale
@@ -35,7 +45,7 @@ from dlo_calibration.vision.tracer import Trace, Tracer, write_picture
 
 LARGEST_DIAMETER = 0.2  # m
 COUNTS = (3, MOST_POINTS)  # of a chain's points
-COUNT, HANGING_COUNT = 21, 41  # of these, if the user does not say
+COUNT = 21  # of these, if the user does not say; of one that hangs, HANGING_COUNT
 FEWEST_HANGING = 9  # points of a chain that hangs, four of which are in the clamps
 LARGEST_MASS = 1000.0  # kg
 ONLY_HANGING = {'clamps': '--clamps', 'plumb': '--plumb', 'mass': '--mass'}
@@ -90,11 +100,9 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     if scale is not None:
         diameter = chosen.diameter or measured_diameter(trace, scale)
         if chosen.hanging is not None:
-            chain = _hanging(chosen, trace, scale)
-            line = scale.to_table(trace.pixels, chosen.hanging)
-            along = arc_lengths(line)
-            length = float(along[-1])
-            shown = scale.to_pixels(along_line(line, along, np.linspace(0.0, length, chosen.count - 2)))
+            hangs = _hanging(chosen, trace, scale)
+            chain, shown = hangs.chain, hangs.scale.to_pixels(hangs.chain.points[1:-1])
+            length = float(arc_lengths(scale.to_table(trace.pixels, chosen.hanging))[-1])
         else:
             above = {k: crossing.first_above for k, crossing in enumerate(trace.crossings)
                      if crossing.first_above is not None}
@@ -170,13 +178,13 @@ def _scale(chosen: argparse.Namespace, photograph: Photograph, trace: Trace) -> 
     return scale_from_points(pixels, table, photograph.size, lens, photograph.focal_length)
 
 
-def _hanging(chosen: argparse.Namespace, trace: Trace, scale: Scale) -> Chain:
-    """Return the chain of a DLO that hangs between clamps."""
+def _hanging(chosen: argparse.Namespace, trace: Trace, scale: Scale) -> HangingDlo:
+    """Return the DLO that hangs between clamps."""
     if chosen.scale is not None and chosen.plumb is None:
         down = np.array([0.0, -1.0])
     else:
         down = straight_down(scale, trace.pixels, _two(chosen.plumb, '--plumb'))
-    return hanging_chain(trace, scale, down, chosen.count, chosen.hanging, _two(chosen.clamps, '--clamps'))
+    return hanging_dlo(trace, scale, down, chosen.count, chosen.hanging, _two(chosen.clamps, '--clamps'))
 
 
 def _write(chosen: argparse.Namespace, chain: Chain, diameter: float) -> None:

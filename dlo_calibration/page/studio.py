@@ -199,7 +199,7 @@ class Studio:
             if trial is None:
                 raise InputError(f'animation of trial {number + 1}', 'a trial that is not complete',
                                  'a complete trial', 'complete it as the page says')
-            scale = self._drafts.photographs[self._checked(identity)].scale
+            scale = self._drafts.photographs[self._checked(identity)].trial_scale
             if scale is None:
                 raise InputError('animation', 'a photograph without a scale', 'one with a scale',
                                  'give it a scale first')

@@ -26,7 +26,7 @@ export class Animation {
       result.outdated ||
       calibration.state === 'calibrating' ||
       !app.seen?.scale ||
-      !app.entry?.goal
+      !(app.entry?.goal || app.hangs(app.entry))
     )
       return null;
     const of = JSON.stringify([result.parameters, app.project.state.revision]);
@@ -51,7 +51,7 @@ export class Animation {
     if (this.#of !== of) return;
     if (animation) this.#animations.set(key, animation);
     else this.#failed.add(key);
-    if (animation && app.role === 'goal') app.player.stop(animation.times[animation.goal]);
+    if (animation && (app.role === 'goal' || app.hangs(app.entry))) app.player.stop(animation.times[animation.goal]);
     app.refresh();
   }
 
@@ -80,7 +80,7 @@ export class Animation {
         ? app.player.controls(
             animation.times.at(-1),
             'Animation of the simulated DLO',
-            atGoal && app.role === 'goal' ? 'compared with the goal' : '',
+            atGoal && (app.role === 'goal' || app.hangs(app.entry)) ? 'compared with the goal' : '',
           )
         : asked
           ? h('p.note', {role: 'status'}, 'The animation is being simulated …')

@@ -30,20 +30,25 @@ export class HandsStep {
 
   /** List [trial, role] without a movement of a hand. */
   open() {
-    return this.app.project.document.trials.flatMap((trial, k) => (trial.steps.length ? [] : [[k, 'start']]));
+    return this.app.project.document.trials.flatMap((trial, k) => (this.#told(trial) ? [] : [[k, 'start']]));
   }
 
   missing() {
     const {trials} = this.app.project.document;
     const open = trials.flatMap((trial, k) =>
-      trial.steps.length ? [] : [`what the hand did in trial ${k + 1}`],
+      this.#told(trial) ? [] : [`what the hand did in trial ${k + 1}`],
     );
     return trials.length ? open : ['a trial'];
   }
 
   done() {
     const {trials} = this.app.project.document;
-    return trials.length > 0 && trials.every((trial) => trial.steps.length);
+    return trials.length > 0 && trials.every((trial) => this.#told(trial));
+  }
+
+  /** @returns {boolean} whether the movements of a trial are described, or nothing moves in it */
+  #told(trial) {
+    return trial.steps.length > 0 || this.app.hangs(trial);
   }
 
   clicks() {
@@ -88,6 +93,8 @@ export class HandsStep {
     const {app} = this;
     const {entry} = app;
     if (!entry) return [h('p', {}, 'There is no trial yet: add photographs in step 1.')];
+    if (app.hangs(entry))
+      return [h('p', {}, 'No hand moves in this trial: the DLO hangs between two clamps.'), warnings(app, 3)];
     const {steps} = entry;
     if (!steps.length || this.adding) return [...this.#list(steps.length), problem(app.project, PLACE)];
     this.chosen = Math.min(this.chosen, steps.length - 1);

@@ -4,6 +4,7 @@
 /** The page: which step, trial and photograph is shown, and what all steps share. */
 
 import {CalibrationStep} from './calibration.js';
+import {hangs} from './clamps.js';
 import {h, patch} from './dom.js';
 import {FilmStep} from './filming.js';
 import {listen} from './gestures.js';
@@ -113,6 +114,11 @@ class App {
   /** @returns {object | undefined} what the server knows of it */
   get seen() {
     return this.id ? this.project.seen(this.id) : undefined;
+  }
+
+  /** @returns {boolean} whether the DLO of a trial hangs: its photograph is the whole trial */
+  hangs(trial) {
+    return Boolean(trial) && hangs(this.project.photograph(trial.start));
   }
 
   /** Go to a step. */

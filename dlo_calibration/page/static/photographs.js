@@ -4,10 +4,11 @@
 /** Step 1, photographs: their files, and the start and goal of each trial. */
 
 import {openCamera} from './camera.js';
+import {HANGING} from './clamps.js';
 import {h} from './dom.js';
 import {dropped} from './dropped.js';
 import {introduction} from './introduction.js';
-import {button, choice, files, problem} from './parts.js';
+import {button, choice, files, problem, tick} from './parts.js';
 import {address} from './picture.js';
 import {counted} from './words.js';
 
@@ -49,13 +50,13 @@ export class PhotographsStep {
 
   missing() {
     const {films, photographs, trials} = this.app.project.document;
-    if (!photographs.length) return films.length ? [] : ['two photographs, or a film'];
-    return trials.flatMap((trial, k) => (trial.goal ? [] : [`the goal photograph of trial ${k + 1}`]));
+    if (!photographs.length) return films.length ? [] : ['two photographs, one of a DLO that hangs, or a film'];
+    return trials.flatMap((trial, k) => (trial.goal || this.app.hangs(trial) ? [] : [`the goal photograph of trial ${k + 1}`]));
   }
 
   done() {
     const {films, trials} = this.app.project.document;
-    return trials.length + films.length > 0 && trials.every((trial) => trial.goal);
+    return trials.length + films.length > 0 && trials.every((trial) => trial.goal || this.app.hangs(trial));
   }
 
   /** Add files, one after the other. */
@@ -224,6 +225,22 @@ export class PhotographsStep {
 
   #trial(trial, k) {
     const sides = Object.keys(SIDES).some((role) => trial[role]);
+    const hanging = this.app.hangs(trial);
+    const hangs = tick({
+      label: 'It hangs between two clamps, at rest: one photograph is a whole trial',
+      checked: hanging,
+      key: 'hangs',
+      onset: (value) => this.#hang(trial, k, value),
+    });
+    if (hanging)
+      return h(
+        'fieldset.trialcard',
+        {key: k},
+        h('legend', {}, `Trial ${k + 1}`),
+        h('div.slots', {}, this.#slot(trial, k, 'start', 'The DLO between the clamps')),
+        hangs,
+        h('div.row', {}, this.#removal(k)),
+      );
     return h(
       'fieldset.trialcard',
       {key: k},
@@ -249,6 +266,7 @@ export class PhotographsStep {
           Object.entries(SIDES).map(([role, text]) => this.#slot(trial, k, role, text)),
         ),
       ),
+      hangs,
       h(
         'div.row',
         {},
@@ -262,16 +280,36 @@ export class PhotographsStep {
             }),
           {disabled: !trial.goal},
         ),
-        button(
-          'Remove trial',
-          () =>
-            this.#change((now) => {
-              now.trials.splice(k, 1);
-            }),
-          {'aria-label': `Remove trial ${k + 1}`},
-        ),
+        this.#removal(k),
       ),
     );
+  }
+
+  #removal(k) {
+    return button(
+      'Remove trial',
+      () =>
+        this.#change((now) => {
+          now.trials.splice(k, 1);
+        }),
+      {'aria-label': `Remove trial ${k + 1}`},
+    );
+  }
+
+  /** Make the start of a trial a photograph of a DLO that hangs, or not; a goal hangs in a trial of its own. */
+  #hang(trial, k, value) {
+    const alone = {goal: null, start_side: null, goal_side: null, steps: []};
+    this.#change((now) => {
+      const set = (id) => {
+        now.photographs.find((photograph) => photograph.id === id).scale = value ? {...HANGING, clamps: []} : null;
+      };
+      set(trial.start);
+      if (!value) return;
+      Object.assign(now.trials[k], alone);
+      if (!trial.goal || now.trials.some(({start}) => start === trial.goal)) return;
+      set(trial.goal);
+      now.trials.splice(k + 1, 0, {start: trial.goal, ...alone});
+    });
   }
 
   #slot(trial, k, role, text) {

@@ -3,6 +3,7 @@
 
 /** Step 2, scale: from pixels of a photograph to places on the table. */
 
+import {Clamps, hangs} from './clamps.js';
 import {h} from './dom.js';
 import {KnownPoints, PLACE} from './known_points.js';
 import {line} from './line.js';
@@ -17,11 +18,13 @@ export class ScaleStep {
   title = 'Scale';
   sides = true;
   #points;
+  #clamps;
   #obstacles;
 
   constructor(app) {
     this.app = app;
     this.#points = new KnownPoints(app);
+    this.#clamps = new Clamps(app);
     this.#obstacles = new Obstacles(app);
   }
 
@@ -39,7 +42,8 @@ export class ScaleStep {
   }
 
   ready(id) {
-    return Boolean(this.app.project.seen(id)?.scale);
+    const {scale} = this.app.project.photograph(id); // of a DLO that hangs, the line gives it in the next step
+    return Boolean(this.app.project.seen(id)?.scale || scale?.length || scale?.gap);
   }
 
   done() {
@@ -48,7 +52,7 @@ export class ScaleStep {
   }
 
   clicks() {
-    return this.#pointed || this.#obstacles.placing;
+    return this.#pointed || this.#hanging || this.#obstacles.placing;
   }
 
   /** Whether the scale of the photograph comes from points that are clicked. */
@@ -56,12 +60,26 @@ export class ScaleStep {
     return this.app.photograph?.scale?.kind === 'points';
   }
 
+  get #hanging() {
+    return hangs(this.app.photograph);
+  }
+
   panel() {
     const {app} = this;
     const {photograph, seen} = app;
     if (!photograph) return [h('p', {}, 'There is no photograph yet: add one in step 1.')];
+    if (this.#hanging)
+      return [
+        h('h3', {}, photograph.name),
+        this.#clamps.panel(photograph),
+        problem(app.project, PLACE),
+        h('div', {role: 'status'}, this.#outcome(seen)),
+        this.#lens(),
+      ];
     const kind = photograph.scale?.kind ?? 'none';
-    const others = app.used().filter(([, , id]) => id !== photograph.id);
+    const others = app
+      .used()
+      .filter(([, , id]) => id !== photograph.id && !hangs(app.project.photograph(id)));
     return [
       h('h3', {}, photograph.name),
       h(
@@ -110,7 +128,7 @@ export class ScaleStep {
 
   #choice(value, kind, text) {
     const {app} = this;
-    const first = app.used().find(([, , id]) => id !== app.id)?.[2];
+    const first = app.used().find(([, , id]) => id !== app.id && !hangs(app.project.photograph(id)))?.[2];
     const scales = {
       board: {kind: 'board', ruler: RULER},
       points: {kind: 'points', points: []},
@@ -166,10 +184,14 @@ export class ScaleStep {
         'p',
         {},
         h('strong', {}, 'The scale is known. '),
-        `Its points fit to ${millimetres(residual, 2)}. `,
-        residual > POOR
-          ? 'That is a large error: check the points.'
-          : 'Check that the grid lies flat on the table in the photograph.',
+        this.#hanging
+          ? 'Check that the grid stands upright in the photograph.'
+          : [
+              `Its points fit to ${millimetres(residual, 2)}. `,
+              residual > POOR
+                ? 'That is a large error: check the points.'
+                : 'Check that the grid lies flat on the table in the photograph.',
+            ],
       ),
       warnings.map((text) => h('p.note', {}, text)),
     );
@@ -215,7 +237,11 @@ export class ScaleStep {
         h('g.label', {'data-u': u, 'data-v': v}, h('text', {x: 4, y: -4}, label)),
       );
     });
-    const points = this.#pointed ? this.#points.marks(photograph) : [];
+    const points = this.#pointed
+      ? this.#points.marks(photograph)
+      : this.#hanging
+        ? this.#clamps.marks(photograph)
+        : [];
     const corners = points.length
       ? []
       : (seen.scale?.pixels ?? []).map(([u, v], k) =>
@@ -227,6 +253,7 @@ export class ScaleStep {
   tap(pixel) {
     if (this.#obstacles.placing) this.#obstacles.tap(pixel);
     else if (this.#pointed) this.#points.tap(pixel);
+    else if (this.#hanging) this.#clamps.tap(pixel);
   }
 
   grab(name) {
@@ -242,7 +269,7 @@ export class ScaleStep {
   }
 
   #of(mark) {
-    return mark.startsWith('obstacle') ? this.#obstacles : this.#points;
+    return mark.startsWith('obstacle') ? this.#obstacles : mark.startsWith('clamp') ? this.#clamps : this.#points;
   }
 
   #set(scale, merge) {
@@ -268,8 +295,8 @@ export class ScaleStep {
     this.app.project.edit(
       (now) => {
         for (const other of now.photographs) {
-          if (other.id === source || other.id === id || (scale.kind !== 'board' && sides.has(other.id)))
-            continue;
+          if (other.id === source || other.id === id || hangs(other)) continue;
+          if (scale.kind !== 'board' && sides.has(other.id)) continue;
           other.scale = scale.kind === 'board' ? structuredClone(scale) : {kind: 'same', photograph: source};
         }
       },
@@ -282,7 +309,7 @@ export class ScaleStep {
       this.app.seen?.scale
         ? legend(
             [
-              ['grid', 'grid of the table'],
+              ['grid', this.#hanging ? 'grid of the plane in which it hangs' : 'grid of the table'],
               this.#pointed ? ['mark known', 'known point'] : null,
               this.app.seen.obstacles?.length ? ['obstacle', 'top and foot of an obstacle'] : null,
             ].filter(Boolean),
