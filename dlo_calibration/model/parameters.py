@@ -152,7 +152,7 @@ def knot_names(knots: int) -> tuple[str, ...]:
 
 #: The paper's four, then those that are fixed by default.
 PARAMETERS: tuple[Parameter, ...] = (
-    Parameter('flexibility', 'bending stiffness EI', 'N m^2', 10**-1.0, 10**-5.5, 50.0,
+    Parameter('flexibility', 'bending stiffness EI', 'N m^2', 10**1.0, 10**-5.5, 65.4,
               'how easily the DLO bends', per_weight=True),
     Parameter('elasticity', 'stretching stiffness EA', 'N', 1e4, 1e0, 25.0,
               'how easily the DLO stretches', per_weight=True),
@@ -229,6 +229,13 @@ PART_NAMES = tuple(part_name(part) for part in range(2, MOST_PARTS + 1))
 HANDS = ('hand_delay', 'hand_shift_x', 'hand_shift_y', 'hand_shift_z')
 REST_SHAPE = ('clamp_twist', *knot_names(KNOTS[-1]))
 PAPER_PARAMETERS = ('flexibility', 'elasticity', 'friction', 'self_collision')
+SCALES = 2  # version of the scales in files; in the first, `flexibility` began at 0.1 N m^2
+_FIRST_FLEXIBILITY = replace(BY_NAME['flexibility'], at_zero=0.1)
+
+
+def from_first_scale(value: float) -> float:
+    """Return a `flexibility` of version 1 of the scales on today's scale; both are 0 to 100."""
+    return BY_NAME['flexibility'].value(_FIRST_FLEXIBILITY.physical(value))
 
 
 def _absent_knots(knots: int) -> tuple[str, ...]:

@@ -135,7 +135,7 @@ def test_a_sensitive_outlier_widens_intervals_but_decides_nothing(session):
 
 
 MASS, LENGTH, RADIUS = 0.03, 0.6, 0.004  # kg, m, m
-TRUE = {'flexibility': 60.0, 'elasticity': 40.0, 'friction': 65.0, 'self_collision': 25.6, 'damping': 50.0}
+TRUE = {'flexibility': 72.3, 'elasticity': 40.0, 'friction': 65.0, 'self_collision': 25.6, 'damping': 50.0}
 GENTLE = ((0, (0.10, 0.20), 0.0), (10, (0.15, -0.18), 1.3), (20, (-0.25, 0.12), 2.6), (5, (0.10, 0.10), 0.5))
 
 
@@ -194,7 +194,7 @@ def test_a_chaotic_trial_of_a_known_rope_is_named_and_the_result_is_usable():
 
 @pytest.mark.parametrize('wrong', [
     pytest.param(lambda: coiled(5, damping=65.0), id='drag', marks=pytest.mark.long),
-    pytest.param(lambda: carried(5, 0, (-0.25, 0.2), 2.0, flexibility=85.0), id='another rope',
+    pytest.param(lambda: carried(5, 0, (-0.25, 0.2), 2.0, flexibility=89.6), id='another rope',
                  marks=pytest.mark.long)])
 def test_a_trial_that_went_wrong_is_not_sensitive_though_the_hand_holds_the_rope(wrong):
     result = known_rope(wrong())
