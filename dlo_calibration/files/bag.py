@@ -140,7 +140,7 @@ class Bag:
             options = json.loads(self._options[:OPTIONS_SIZE])
             if isinstance(options, dict):
                 value = options.get('flexibility')
-                if not self._scales and type(value) in (int, float) and 0 <= value <= SCALE:
+                if not self._scales and isinstance(value, (int, float)) and 0 <= value <= SCALE:
                     options['flexibility'] = from_first_scale(value)
                 return options
         self.warnings.append('recorded options that cannot be read are left out')
