@@ -108,7 +108,7 @@ def conducted(robot: str, seed: int, draw: int, limits: AdviceOptions) -> Sessio
         appraised = appraise(make_simulator, trials, options, None, appraisals)
         std = appraised.appraisal.uncertainty.std
         wanted = wanted_deviations(limits.wanted, space)
-        session.course.append(tuple((std * 164.5).round(1).tolist()))
+        session.course.append(tuple((164.5 * std / space.upper).round(1).tolist()))
         columns = [space.free.index(name) for name in names]
         if expected is not None:
             session.ratios += [float(expected[k] / std[k]) for k in columns]

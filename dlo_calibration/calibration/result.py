@@ -115,7 +115,7 @@ class CalibrationResult:
     def of(cls, setting: Setting, prior: Prior, fit: Fit) -> CalibrationResult:
         """Return the result of a fit; `seconds` is 0 until the calibration has ended."""
         trials, best, examination = setting.trials, fit.best, fit.examination
-        uncertainty = spread_of_best(fit.evaluations, best.point)
+        uncertainty = spread_of_best(fit.evaluations, best.point, fit.space.upper)
         if examination is not None:
             uncertainty = examination.uncertainty if examination.regular else uncertainty.of_excited(
                 examination.uncertainty.excited)
@@ -226,7 +226,7 @@ class CalibrationResult:
                 f'leave it out (--without {odd.number})')
 
     def including(self, point: Floats) -> CalibrationResult:
-        """Return a result whose intervals contain a (d,) point of the unit cube as well."""
+        """Return a result whose intervals contain a (d,) point of the box as well."""
         assert self.examination is not None
         uncertainty = self.examination.uncertainty
         uncertainty = uncertainty.within(np.minimum(uncertainty.lower, point),
@@ -269,8 +269,8 @@ class CalibrationResult:
 
     @property
     def std(self) -> Floats:
-        """(d,) standard deviations of the found values, in the unit cube."""
-        return np.array([self.estimates[name].std for name in self.space.free]) / SCALE
+        """(d,) standard deviations of the found values, in units of a search."""
+        return self.space.point({name: self.estimates[name].std for name in self.space.free})
 
     @property
     def errors(self) -> PointErrors:
@@ -320,9 +320,10 @@ def parameter_estimates(space: ParameterSpace, best: Evaluation, uncertainty: Un
     :param guessed: names of the parameters whose default was estimated from the chains alone.
     """
     parameters = {}
+    columns = [space.values(each) for each in (best.point, uncertainty.lower, uncertainty.upper,
+                                               uncertainty.std)]
     for k, name in enumerate(space.free):
-        value, lower, upper = (float(x) * SCALE for x in (
-            best.point[k], uncertainty.lower[k], uncertainty.upper[k]))
+        value, lower, upper, std = (column[name] for column in columns)
         (at_value, unit), (at_lower, _), (at_upper, _) = (
             space.reported(name, x) for x in (value, lower, upper))
         note = ''
@@ -338,7 +339,7 @@ def parameter_estimates(space: ParameterSpace, best: Evaluation, uncertainty: Un
             if uncertainty.at_bound[k]:
                 note += ', where the best value is'
         parameters[name] = ParameterEstimate(
-            name, value, float(uncertainty.std[k]) * SCALE, lower, upper, at_value, low, high, unit,
+            name, value, std, lower, upper, at_value, low, high, unit,
             own_verdict == IDENTIFIABLE, own_verdict, note)
     return parameters
 
@@ -351,7 +352,7 @@ def hand_estimates(setting: Setting) -> dict[str, ParameterEstimate]:
         scale = SCALE / (parameter.at_hundred - parameter.at_zero)
         low, high = (at + side * DEVIATIONS * deviations[name] for side in (-1, 1))
         value, lower, upper = map(parameter.value, (at, low, high))
-        words = verdict(lower / SCALE, upper / SCALE)
+        words = verdict(*(each / SCALE * parameter.extent for each in (lower, upper, SCALE)))
         estimates[name] = ParameterEstimate(
             name, value, deviations[name] * scale, lower, upper, at, low, high, parameter.unit,
             words == IDENTIFIABLE, words, 'as the chains show it, without simulation')
@@ -426,8 +427,7 @@ def plain(result: CalibrationResult) -> dict[str, Any]:
         'noise_m': examination and examination.noise,
         'residual_std_m': examination and examination.uncertainty.residual,
         'correlations': result.correlations,
-        'advice': advice and {**asdict(advice), **{key: getattr(advice, key) * SCALE for key in (
-            'std', 'expected_std', 'lower', 'upper')}},
+        'advice': advice and {**asdict(advice), **advice.of_hundred},
         'explanations': {missing.name: missing.share for missing in result.missing_parameters},
         'undetermined': result.undetermined,
         'together': [{**asdict(pair), 'words': pair.words} for pair in result.together],

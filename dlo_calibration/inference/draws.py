@@ -19,7 +19,7 @@ def drawn_points(point: Floats, uncertainty: Uncertainty, count: int, seed: int)
     """
     Return draws, (count, d), of what is known: a Latin hypercube, so that few draws cover each parameter.
 
-    :param point: (d,) the best values in the unit cube; a parameter of which nothing is known does not keep
+    :param point: (d,) the best values in the box; a parameter of which nothing is known does not keep
         to its value.
     """
     generator = np.random.default_rng(seed)
@@ -27,4 +27,5 @@ def drawn_points(point: Floats, uncertainty: Uncertainty, count: int, seed: int)
     normal = np.vectorize(NormalDist().inv_cdf)(shares)
     values, axes = np.linalg.eigh(uncertainty.spread)
     drawn = point + normal @ (axes * np.sqrt(np.maximum(values, 0.0))).T
-    return np.clip(np.where(uncertainty.unknown, shares, drawn), EDGE, 1 - EDGE)
+    return np.clip(np.where(uncertainty.unknown, shares * uncertainty.ends, drawn), EDGE,
+                   uncertainty.ends - EDGE)

@@ -70,10 +70,12 @@ def test_the_default_space_has_the_four_parameters_of_the_paper():
     assert space.dimension == 4
 
 
-def test_a_point_of_the_cube_and_the_values_of_its_parameters():
+def test_a_point_of_the_box_and_the_values_of_its_parameters():
     space = ParameterSpace(('friction', 'flexibility'))
-    assert space.values([0.25, 1.0]) == {'friction': 25.0, 'flexibility': 100.0}
-    assert space.point({'flexibility': 100.0, 'friction': 25.0}).tolist() == [0.25, 1.0]
+    assert space.upper == pytest.approx([1.0, 6.5 / 4.5])
+    assert space.values([0.25, space.upper[1]]) == {'friction': 25.0, 'flexibility': 100.0}
+    assert space.point({'flexibility': 100.0, 'friction': 25.0}).tolist() == [0.25, space.upper[1]]
+    assert BY_NAME['flexibility'].coordinate(0.1) == pytest.approx(2 / 4.5)
     with pytest.raises(ValueError):
         space.values([0.5])  # a coordinate is missing
 
