@@ -44,8 +44,8 @@ from dlo_calibration.workspace.live_information import appraise, Appraised  # no
 from dlo_calibration.workspace.next_action import LEAST_TRIALS, next_action, NextAction  # noqa: E402
 
 MIDDLE = (25.0, 75.0)  # of the scale
-WANTED = 'flexibility 2, friction 3'
-ALL_WANTED = 'flexibility 2, friction 3, elasticity 5, self_collision 5'
+WANTED = 'flexibility 1.4, friction 3'
+ALL_WANTED = 'flexibility 1.4, friction 3, elasticity 5, self_collision 5'
 MOST = 12  # trials
 ASKS, RANDOM, GUIDE = 'advise', 'random', 'guide'
 

@@ -26,7 +26,7 @@ from dlo_calibration.model.trial import Goal, shown_goals, Trial
 from dlo_calibration.observation.noise import noise, noise_of
 from dlo_calibration.observation.table import HANGING, lowest_level, RESTING_BAND
 
-SHORTEST, LONGEST = 0.02, 15.0  # m; hands manipulate no DLO beyond; half a metre in inches is 20
+SHORTEST, LONGEST = 0.009, 16.5  # m; 1 cm to 15 m, measured with noise; half a metre in inches is 20
 UNITS = {'millimetres': 1e-3, 'centimetres': 1e-2, 'inches': 0.0254}
 BELOW = 0.01  # m; a table may be measured with such an error, and trackers see the table through a thin DLO
 SIGMAS = 5.0  # standard deviations that noise never exceeds

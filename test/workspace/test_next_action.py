@@ -109,8 +109,9 @@ def test_a_dlo_out_of_reach_is_only_tidied():
 
 
 def test_what_is_wanted_is_read_from_a_text():
-    assert read_targets('flexibility 2, friction 3.5') == {'flexibility': 0.02, 'friction': 0.035}
-    assert read_targets('EI 5 %')['flexibility'] == pytest.approx(np.log(1.05) / np.log(10**6.5))
+    assert read_targets('flexibility 2, friction 3.5') == {
+        'flexibility': pytest.approx(0.02 * 6.5 / 4.5), 'friction': 0.035}
+    assert read_targets('EI 5 %')['flexibility'] == pytest.approx(np.log(1.05) / np.log(10**4.5))
     identifiable = wanted_deviations('', ParameterSpace())
     assert 2 * DEVIATIONS * identifiable == pytest.approx([0.2] * 4)
     assert wanted_deviations('friction 3', ParameterSpace())[0] == np.inf
