@@ -34,12 +34,14 @@ from dlo_calibration.inference.uncertainty import (
     verdict,
 )
 from dlo_calibration.model.chain import Floats, frozen_array, interpolate_unseen
-from dlo_calibration.model.parameters import BY_NAME, measured, number, ParameterSpace, SCALE
+from dlo_calibration.model.parameters import BY_NAME, GRAVITY, measured, number, ParameterSpace, SCALE
 from dlo_calibration.model.score import distances, MEAN_DISTANCE, observed, PointErrors
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.noise import NO_NOISE, noise
 
 NOT_USABLE = 'the result is not usable'  # note of its parameters
+#: Bending stiffness over weight and squared length of a DLO that hangs limp, and of one that hardly sags.
+LIMP, RIGID = 0.01, 10.0
 WORST = 0.1  # of the length; good models of real DLOs miss the measured points by 0.3 to 3 % of it
 
 
@@ -134,16 +136,18 @@ class CalibrationResult:
         Why the parameters should not be used, in one sentence; '' if they can be.
 
         The first of these reasons counts: a trial is implausible; stamps or places of the hands are wrong;
-        the fit is far worse than models of DLOs are; a trial that does not fit the others decides a value,
-        unless it is sensitive; two engines differ by more than the fit misses the measurement; the search
-        ended before a minimum; the fit is not better than the default parameters, though noise does not
-        explain it; the trials determine no parameter.
+        the stiffness may lie beyond its scale; the fit is far worse than models of DLOs are; a trial that
+        does not fit the others decides a value, unless it is sensitive; two engines differ by more than the
+        fit misses the measurement; the search ended before a minimum; the fit is not better than the default
+        parameters, though noise does not explain it; the trials determine no parameter.
         """
         mean, examination, other = self.errors.mean, self.examination, self.confirmation
         if self.implausible:
             return self.implausible[0]
         if self.hand_error:
             return self.hand_error
+        if self._beyond_scale:
+            return self._beyond_scale
         if mean > WORST * self.length:
             return (f'the mean error is {number(100 * mean / self.length)} % of the length; check frames, '
                     'grips and clocks')
@@ -166,6 +170,29 @@ class CalibrationResult:
                 f'next, {self.advice.words}'
             return f'these trials determine none of the parameters; {remedy}'
         return ''
+
+    @cached_property
+    def _beyond_scale(self) -> str:
+        """Why the stiffness of a very short and light, or a very long and heavy DLO may lack, in words."""
+        examination, name = self.examination, 'flexibility'
+        if examination is None or examination.noise_alone or name not in self.space.free or \
+                'mass' in self.space.free:
+            return ''
+        parameter, mass = BY_NAME[name], self.physical()['mass']
+        limp = self.values[name] > 0
+        if self.estimates[name].upper < SCALE if limp else not (
+                examination.uncertainty.at_bound[self.space.free.index(name)]):
+            return ''
+        end = parameter.at_hundred if limp else parameter.at_zero
+        share = end / (mass * GRAVITY * self.length**2)
+        power = math.ceil(math.log10(share / LIMP)) if limp else math.floor(math.log10(share / RIGID))
+        factor = 10.0**power
+        if (factor <= 1) == limp:  # the scale contains all that such a DLO may be
+            return ''
+        whose, by = ('its own', f'{factor:g}') if self.space.mass_known else ('what is assumed', 'its weight')
+        return (f'flexibility may lie beyond the end of its scale, {measured(end, parameter.unit)}: give a '
+                f'mass of {number(factor * mass)} kg, {factor:g} times {whose}, and divide all stiffnesses '
+                f'by {by}, as motion tells only their ratio to the weight')
 
     @property
     def headline(self) -> str:

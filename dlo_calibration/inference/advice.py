@@ -35,7 +35,7 @@ from dlo_calibration.inference.uncertainty import DEVIATIONS, IDENTIFIABLE_WIDTH
 from dlo_calibration.model.action import Action
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.named_actions import Drag, GraspAndPlace, LiftAndHold, NamedAction, TwoHands
-from dlo_calibration.model.parameters import BY_NAME, ParameterSpace, SCALE
+from dlo_calibration.model.parameters import BY_NAME, number, ParameterSpace, SCALE
 from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.observation.excitation import excites
 
@@ -201,12 +201,12 @@ def candidates(trials: Sequence[Trial]) -> Iterator[Candidate]:
         across = np.array([0.0, 1.0, 0.0])
     side = tuple((across / np.linalg.norm(across)).tolist())
     gap = float(np.linalg.norm(along))
-    cm = f'{30 * length:.0f} cm'
+    cm = _centimetres(0.3 * length)
     for fraction, place in ((0.0, 'the first end'), (0.5, 'the middle')):
         height = 0.4 * length
-        yield from _candidate(f'lift {place} by {100 * height:.0f} cm and hold it', chain,
+        yield from _candidate(f'lift {place} by {_centimetres(height)} and hold it', chain,
                               LiftAndHold(fraction=fraction, height=height))
-        yield from _candidate(f'lift {place} by {100 * height:.0f} cm and watch it while it moves', chain,
+        yield from _candidate(f'lift {place} by {_centimetres(height)} and watch it while it moves', chain,
                               LiftAndHold(fraction=fraction, height=height, speed=0.5), watched=True)
     for fraction, place in ((0.0, 'the first end'), (0.25, 'a quarter of the length'), (0.5, 'the middle')):
         yield from _candidate(f'drag {place} sideways by {cm}', chain,
@@ -218,13 +218,17 @@ def candidates(trials: Sequence[Trial]) -> Iterator[Candidate]:
         GraspAndPlace(fraction=0.0, to=_beyond(chain, 0.7, across)))
     if gap < 0.05 * length:
         return  # the ends touch each other, so that no direction is defined
-    yield from _candidate(f'grip both ends and push them {100 * gap / 3:.0f} cm together', chain,
+    yield from _candidate(f'grip both ends and push them {_centimetres(gap / 3)} together', chain,
                           TwoHands(fractions=(0.0, 1.0), motion='together', distance=gap / 3))
     stretch = 1.03 * length - gap
     if stretch > 0:
         yield from _candidate(
-            f'grip both ends and pull them {100 * stretch:.0f} cm apart, 3 % beyond the straight DLO', chain,
+            f'grip both ends and pull them {_centimetres(stretch)} apart, 3 % beyond the straight DLO', chain,
             TwoHands(fractions=(0.0, 1.0), motion='apart', distance=stretch))
+
+
+def _centimetres(length: float) -> str:
+    return f'{number(float(f"{100 * length:.2g}"))} cm'
 
 
 def _beyond(chain: Chain, fraction: float, across: Floats) -> tuple[float, ...]:

@@ -58,9 +58,9 @@ class Hints:
         object.__setattr__(self, 'excited', frozen_array(self.excited, bool))
 
     @classmethod
-    def none(cls, dimension: int) -> Hints:
+    def none(cls, dimension: int, upper: Ends = 1.0) -> Hints:
         """Return hints without an estimate; all parameters count as excited."""
-        return cls(np.full(dimension, np.nan), np.ones(dimension, np.bool_))
+        return cls(np.full(dimension, np.nan), np.ones(dimension, np.bool_), upper=upper)
 
     @classmethod
     def at(cls, start: Floats, jacobian: Floats | None = None, coarse: bool = False, upper: Ends = 1.0

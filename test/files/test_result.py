@@ -26,6 +26,7 @@ from dlo_calibration.files.result import (
 )
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.parameters import ParameterSpace
+from dlo_calibration.search.protocol import Hints
 from dlo_calibration.search.sampling import RandomSearch
 
 OPTIONS = Options.of({'mass': 0.1 + 0.2, 'calibrate': ['friction', 'flexibility'], 'damping': 1 / 3})
@@ -35,7 +36,8 @@ TRUTH = {'flexibility': 41.0, 'elasticity': 30.0, 'friction': 62.0, 'self_collis
 def calibrated(seed=1, mass=0.1 + 0.2):
     space = ParameterSpace(('friction', 'flexibility'), {'elasticity': 100 / 3, 'damping': 1 / 3}, mass)
     trials = [toy_trial(TRUTH), toy_trial(TRUTH, 'trial 2', turn=0.3)]
-    return fitted(trials, space, ToySimulator(), RandomSearch(2, seed), budget=20, seed=seed)
+    search = RandomSearch(2, seed, Hints.none(2, space.upper))
+    return fitted(trials, space, ToySimulator(), search, budget=20, seed=seed)
 
 
 @pytest.fixture(scope='module')

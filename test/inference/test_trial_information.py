@@ -54,8 +54,8 @@ def noisy_trial(name, seed):
 
 
 def calibrated(trials, simulator=None):
-    return fitted(trials, SPACE, simulator or ToySimulator(), SEARCHES['least_squares'](2, 1, Hints(
-        np.full(2, np.nan), np.ones(2, np.bool_), upper=SPACE.upper)), budget=80)
+    search = SEARCHES['least_squares'](2, 1, Hints.none(2, SPACE.upper))
+    return fitted(trials, SPACE, simulator or ToySimulator(), search, budget=80)
 
 
 def appraised(trials, simulator=None, space=SPACE):
