@@ -42,7 +42,7 @@ class Hints:
     :param jacobian: (m, d) of the residuals at `start` [m per unit]; None: unknown.
     :param coarse: the search ends where a step gains little, before it has converged.
     :param upper: (d,) upper ends of the box, or one for all; the lower ones are 0.
-    :param middle: (d,) of the start points: they fill one unit of each parameter.
+    :param middle: (d,) of the start points: see `spread`.
     """
 
     start: Floats
@@ -69,9 +69,21 @@ class Hints:
         return cls(start, np.ones(len(start), np.bool_), True, jacobian, coarse, upper)
 
     def spread(self, shares: Floats | float) -> Floats:
-        """Return start points, (n, d), for the shares of a unit cube: within a unit around the middle."""
-        width = np.minimum(self.upper, 1.0)
-        return np.asarray(np.clip(self.middle - width / 2, 0.0, self.upper - width) + width * shares)
+        """Return start points, (n, d), for shares of 0 to 1."""
+        return spread(self.middle, self.upper, shares)
+
+
+def spread(middle: Ends, upper: Ends, shares: Floats | float) -> Floats:
+    """
+    Return points, (n, d), that fill one unit of each parameter, as far as its scale allows around the middle.
+
+    All over a wider scale, most of few points would be far from any DLO like those before.
+
+    :param middle: (d,), or one for all; `upper` the upper ends of the box, likewise.
+    :param shares: (n, d) of the unit, 0 to 1.
+    """
+    width = np.minimum(upper, 1.0)
+    return np.asarray(np.clip(middle - width / 2, 0.0, upper - width) + width * shares)
 
 
 Result = TypeVar('Result')
