@@ -22,7 +22,7 @@ CURVATURES = {'rest_curvature_x1': 56.0, 'rest_curvature_y1': 47.0, 'rest_curvat
               'rest_curvature_y2': 54.0, 'rest_curvature_x3': 46.0, 'rest_curvature_y3': 44.0}
 REST_SHAPE = {'flexibility': 58.5, 'torsion': 60.0, 'clamp_twist': 52.0, **CURVATURES}
 
-STRANDS = {'flexibility': 61.9, 'torsion': 60.0, 'bending_friction': 45.0, 'bending_slip': 50.0}
+STRANDS = {'flexibility': 61.9231, 'torsion': 60.0, 'bending_friction': 45.0, 'bending_slip': 50.0}
 
 
 def calibrated(trials, budget=200, names=EVEN.free, parts=0, **rest):
