@@ -115,7 +115,7 @@ def width(check: Check, name: str) -> float:
     k, parameter = check.validation.space.free.index(name), BY_NAME[name]
     half = float(check.comparison.upper[k] - check.comparison.lower[k]) / 2
     ends = sorted((parameter.at_zero, parameter.at_hundred))
-    return (ends[1] / ends[0])**half - 1
+    return (ends[1] / ends[0])**(half / parameter.extent) - 1
 
 
 def main() -> None:

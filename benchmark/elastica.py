@@ -98,7 +98,8 @@ def simulated(session: Path, nodes: int) -> tuple[float, float, float]:
     read = read_session(session)
     options = replace(read.options, calibrate=('flexibility', 'length_scale'), parts=1)
     evaluator = Evaluator(read.trials, options.space, CompiledSimulator(table=False, nodes=nodes))
-    search = LeastSquares(2, 1, Hints.at(np.array([0.55, 0.5])))
+    search = LeastSquares(2, 1, Hints.at(
+        np.array([BY_NAME['flexibility'].coordinate(3e-4), 0.5]), upper=options.space.upper))
     while len(points := search.ask(100)):
         search.tell([Observation(evaluation.point, evaluation.score, evaluation.residuals)
                      for evaluation in (evaluator.evaluate(0, point) for point in points)])

@@ -73,7 +73,7 @@ ACTIONS: tuple[tuple[NamedAction, ...], ...] = (
     (GraspAndPlace(fraction=1.0, direction=(-1.0, 0.45, 0), distance=0.3, height=0.07),
      GraspAndPlace(fraction=1.0, direction=(-0.1, -1.0, 0), distance=0.25, height=0.07),),
 )
-PARAMETERS = {'flexibility': 66.0, 'elasticity': 45.0, 'friction': 70.0, 'self_collision': 25.6}
+PARAMETERS = {'flexibility': 76.5, 'elasticity': 45.0, 'friction': 70.0, 'self_collision': 25.6}
 BOARD = LaidBoard((0.42, -0.30), -0.1)
 SHEETS = (BOARD.sheet,)
 
@@ -101,7 +101,7 @@ def moments(number: int) -> list[Moment]:
     points[:, 0], points[:, 2] = np.linspace(0.0, LENGTH, len(points)), RADIUS
     points = _moved(points, Drag(fraction=0.3, direction=(0, -1, 0), distance=0.04))[0][-1]
     listed: list[Moment] = []
-    flexibility = generator.uniform(50.0, 80.0)
+    flexibility = generator.uniform(65.4, 86.2)
 
     def add(chain: Floats, hand: Floats | None, closed: bool) -> None:
         listed.append(Moment(len(listed) / RATE, chain, hand, closed))
@@ -127,7 +127,7 @@ def moments(number: int) -> list[Moment]:
 
 
 def _moved(points: Floats, named: NamedAction,
-           flexibility: float = 66.0) -> tuple[list[Floats], list[Floats], list[bool]]:
+           flexibility: float = 76.5) -> tuple[list[Floats], list[Floats], list[bool]]:
     """Return the chains during an action, where the hand is, and whether it is closed."""
     chain, options = Chain(points), Options.of(FINE)
     action = named.action(chain)

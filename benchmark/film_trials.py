@@ -37,7 +37,7 @@ DELAYS = np.arange(-0.1, 0.101, 0.005)  # s
 def truth(number):
     """Return the parameters of an object."""
     generator = np.random.default_rng(number)
-    return {**TRUTH, 'flexibility': generator.uniform(45.0, 75.0), 'friction': generator.uniform(50.0, 80.0)}
+    return {**TRUTH, 'flexibility': generator.uniform(61.9, 82.7), 'friction': generator.uniform(50.0, 80.0)}
 
 
 def moves(generator):

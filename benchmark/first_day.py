@@ -53,7 +53,7 @@ NOISE = 0.0007  # m, of one coordinate that it sees
 LIFTED = 0.75  # m; so far above the table's frame is the frame of tracker and hand
 MASS = 0.03  # kg
 NODES, SEEN = 81, 4  # of the simulated rope; the tracker sees every fourth one
-TRUTH = {'flexibility': 42.0, 'elasticity': 60.0, 'friction': 45.0, 'self_collision': 30.0}
+TRUTH = {'flexibility': 59.8, 'elasticity': 60.0, 'friction': 45.0, 'self_collision': 30.0}
 SWING = 3.0  # s after an action, in which the rope comes to rest
 ACTIONS = (  # place of the grip along the rope, 0..1; way of the hand [m]: up, then aside, then down
     (0.0, (0.10, 0.20)), (0.5, (0.15, -0.18)), (1.0, (-0.25, 0.12)), (0.25, (0.05, 0.22)))

@@ -67,9 +67,9 @@ class Comparison:
         self._default = self._on(options)
         prior, result = Prior.of(self._default.trials, self._default.options), fitted(self._default)
         self._hints, self._space = prior.hints, prior.space
-        widths = [(result.parameters[name].upper - result.parameters[name].lower) / 100
-                  for name in self._space.free]
-        self._intervals = np.where(np.array(widths) < NARROW, widths, np.inf)
+        widths = self._space.point({name: result.parameters[name].upper - result.parameters[name].lower
+                                    for name in self._space.free})
+        self._intervals = np.where(widths < NARROW, widths, np.inf)
 
     def _on(self, options: Options) -> Setting:
         return Setting(self._trials, options, make_simulator(options))
@@ -104,7 +104,8 @@ class Comparison:
     def _climb(self, coarse: Fit) -> Fit:
         """Return the fit with the default nodes and steps that starts at the result of a coarse one."""
         if coarse.search == LeastSquares.name:
-            hints = Hints.at(coarse.best.point, None if coarse.model is None else coarse.model.jacobian)
+            hints = Hints.at(coarse.best.point, None if coarse.model is None else coarse.model.jacobian,
+                             upper=self._space.upper)
             search = LeastSquares(self._space.dimension, 1, hints)
             return fit(self._default, self._space, search, BUDGET)
         ranked = sorted(coarse.evaluations, key=attrgetter('score'))[:len(coarse.evaluations) // 10]

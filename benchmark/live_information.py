@@ -34,7 +34,7 @@ from dlo_calibration.calibration.engines import make_simulator  # noqa: E402
 from dlo_calibration.calibration.options import Options  # noqa: E402
 from dlo_calibration.calibration.setting import Setting  # noqa: E402
 from dlo_calibration.inference.trial_information import TrialInformation  # noqa: E402
-from dlo_calibration.model.parameters import SCALE  # noqa: E402
+from dlo_calibration.model.parameters import extents, SCALE  # noqa: E402
 from dlo_calibration.workspace.live_information import LiveInformation  # noqa: E402
 
 DRAWS = 2  # of the noise of each reference object
@@ -77,9 +77,10 @@ def main() -> None:
         for name, trials, options in subjects(Path(folder)):
             promise = promised(trials, options)
             result = fitted(Setting(tuple(trials), options, make_simulator(options)))
+            scale = SCALE / extents(promise.names)
             for k, parameter in enumerate(promise.names):
                 estimate = result.parameters[parameter]
-                std = float(promise.after[k]) * SCALE
+                std = float(promise.after[k] * scale[k])
                 ratios[parameter].append(std / estimate.std)
                 agreed.append(promise.verdicts[k] == estimate.verdict)
                 rows.append(f'| {name} | {len(trials)} | {parameter} | {std:.2f} | {estimate.std:.2f} '

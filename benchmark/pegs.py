@@ -74,7 +74,7 @@ def main() -> None:
         scene.write_text(SCENE, encoding='utf-8')
         for k in range(OBJECTS):
             random = np.random.default_rng(k)
-            truth = {'flexibility': random.uniform(35, 75), 'friction': random.uniform(50, 75)}
+            truth = {'flexibility': random.uniform(55.0, 82.7), 'friction': random.uniform(50, 75)}
             space = ParameterSpace(fixed={**truth, 'self_collision': 25.0}, mass=MASS)
             physical = space.physical({}, LENGTH)
             engine = CompiledSimulator(obstacles=read_scene(str(scene)), nodes=81, time_step=0.0015)

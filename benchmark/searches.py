@@ -26,6 +26,7 @@ from dlo_calibration.calibration.prior import Prior
 from dlo_calibration.evaluation.evaluation import Evaluator
 from dlo_calibration.evaluation.residuals import Huber
 from dlo_calibration.files.session import read_session
+from dlo_calibration.model.parameters import SCALE
 from dlo_calibration.search import Observation, SEARCHES
 
 HERE = Path(__file__).resolve().parent
@@ -68,7 +69,7 @@ def rows_of(name: str, names: list[str], seeds: int, engine: str) -> list[str]:
                    for score in scores]
         middle = float(np.median(reached))
         worst = max(loss.cost(each) for each in residuals[method]) / lowest
-        points = 100 * np.array([best.point for _, best in done[method]])
+        points = SCALE / evaluator.space.upper * np.array([best.point for _, best in done[method]])
         shown = [list(evaluator.space.free).index(each) for each in SHOWN]
         spread = ' | '.join(f'{points[:, k].mean():.1f} ± {points[:, k].std():.2f}' for k in shown)
         rows.append(

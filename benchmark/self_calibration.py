@@ -44,8 +44,8 @@ from dlo_calibration.workspace.live_information import appraise, Appraised  # no
 from dlo_calibration.workspace.next_action import LEAST_TRIALS, next_action, NextAction  # noqa: E402
 
 MIDDLE = (25.0, 75.0)  # of the scale
-WANTED = 'flexibility 2, friction 3'
-ALL_WANTED = 'flexibility 2, friction 3, elasticity 5, self_collision 5'
+WANTED = 'flexibility 1.4, friction 3'
+ALL_WANTED = 'flexibility 1.4, friction 3, elasticity 5, self_collision 5'
 MOST = 12  # trials
 ASKS, RANDOM, GUIDE = 'advise', 'random', 'guide'
 
@@ -108,7 +108,7 @@ def conducted(robot: str, seed: int, draw: int, limits: AdviceOptions) -> Sessio
         appraised = appraise(make_simulator, trials, options, None, appraisals)
         std = appraised.appraisal.uncertainty.std
         wanted = wanted_deviations(limits.wanted, space)
-        session.course.append(tuple((std * 164.5).round(1).tolist()))
+        session.course.append(tuple((164.5 * std / space.upper).round(1).tolist()))
         columns = [space.free.index(name) for name in names]
         if expected is not None:
             session.ratios += [float(expected[k] / std[k]) for k in columns]

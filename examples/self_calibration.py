@@ -25,7 +25,7 @@ from robot_session import action, chain, LATCHED, values
 from sensor_msgs.msg import PointCloud2
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
-TRUTH = {'flexibility': 45.0, 'elasticity': 35.0, 'friction': 60.0, 'self_collision': 45.0}
+TRUTH = {'flexibility': 61.9, 'elasticity': 35.0, 'friction': 60.0, 'self_collision': 45.0}
 REST = 1.0  # s from the end of an action until the rope rests
 
 

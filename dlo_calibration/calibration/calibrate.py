@@ -92,7 +92,8 @@ def calibrate(trials: Sequence[Trial], options: Options | None = None, *,
         result = with_missing_parameters(setting, result)
         result = confirm(result)
     implausible = implausible_trials(trials, options.table_top, bool(options.scene))
-    observed = () if implausible else observation_warnings(trials, options.table_top, options.mass)
+    observed = () if implausible else observation_warnings(
+        trials, options.table_top, options.mass, options.time_step)
     counted = (text if count == 1 else f'{text} ({count} times)' for text, count in Counter(warnings).items())
     return replace(result, choice=setting.choice, implausible=implausible, seconds=clock() - begun,
                    warnings=(*implausible, *observed, *setting.hand_warnings,

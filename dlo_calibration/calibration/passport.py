@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 import datetime
 import functools
 from importlib.metadata import PackageNotFoundError, version
+import math
 from types import MappingProxyType
 from typing import Mapping
 
@@ -24,6 +25,7 @@ from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Goal, Trial
 
 LEAST_STAMP = 946684800  # s: stamps before the year 2000 are those of a clock that counts from its start
+BENDING = 0.1 * math.pow(10**-5.5 / 0.1, 0.5)  # N m^2, EI of the rope: bit for bit that of earlier versions
 RESOLUTION = 1e-9  # m; the engine gives the same bits everywhere, and a DLO does not show less
 
 
@@ -110,7 +112,7 @@ def engine_version() -> str:
     trial = Trial('rope', initial, (Action((Hand('hand', (0,), np.array([0.1, 0.5, 0.9]), path),)),),
                   (Goal(initial, 0.5, stable=False, held_by=('hand',)), Goal(initial, 1.0)))
     fixed = {'internal_damping': 20.0, 'natural_curvature': 10.0, 'bending_friction': 30.0, 'torsion': 40.0}
-    physical = ParameterSpace(fixed=fixed, mass=0.03).physical({}, 0.6)
+    physical = {**ParameterSpace(fixed=fixed, mass=0.03).physical({}, 0.6), 'flexibility': BENDING}
     with closing(make_simulator(Options(engine='compiled', settle_limit=1.0))) as simulator:
         chains = simulator.simulate(trial, physical).chains
     return digest(np.round(chains / RESOLUTION))[:8]

@@ -56,21 +56,22 @@ class Prior:
         start = _with_cable(space, start_point(trials, space, height))
         for name, value in evidence.estimates.items():
             if name in space.free:
-                start[space.free.index(name)] = BY_NAME[name].value(value) / SCALE
-        hints = Hints(start, shown & [name not in HANDS or name in evidence.estimates for name in space.free])
+                start[space.free.index(name)] = BY_NAME[name].coordinate(value)
+        hints = Hints(start, shown & [name not in HANDS or name in evidence.estimates for name in space.free],
+                      upper=space.upper, middle=np.where(np.isnan(start), space.default_point(), start))
         default = BY_NAME[GUESSED].default
         if GUESSED not in space.free or space.fixed.get(GUESSED, default) != default:
             return cls(space, hints)
-        radius = float(hints.start[space.free.index(GUESSED)])
-        if not 0 <= radius <= 1:
+        radius = space.values(hints.start)[GUESSED]
+        if not 0 <= radius <= SCALE:
             return cls(space, hints)
-        return cls(replace(space, fixed={**space.fixed, GUESSED: radius * SCALE}), hints, (GUESSED,))
+        return cls(replace(space, fixed={**space.fixed, GUESSED: radius}), hints, (GUESSED,))
 
 
 def _with_cable(space: ParameterSpace, start: Floats) -> Floats:
     """Return the (d,) prior estimate, with values of a cable if friction between strands is calibrated."""
     if 'bending_friction' not in space.free:
         return start.copy()
-    cable = np.array([BY_NAME[name].value(CABLE[name]) / SCALE if name in CABLE else np.nan
+    cable = np.array([BY_NAME[name].coordinate(CABLE[name]) if name in CABLE else np.nan
                       for name in space.free])
     return np.asarray(np.where(np.isnan(start), cable, start))

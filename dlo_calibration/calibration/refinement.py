@@ -35,14 +35,14 @@ from dlo_calibration.inference.cross_validation import (
 )
 from dlo_calibration.inference.uncertainty import noise_alone
 from dlo_calibration.model.chain import Floats, frozen_array
-from dlo_calibration.model.parameters import BY_NAME, KNOTS, LOCKING, MOST_PARTS, ParameterSpace, SCALE
+from dlo_calibration.model.parameters import BY_NAME, KNOTS, LOCKING, MOST_PARTS, ParameterSpace
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.material import clamp_twist, clamps
 from dlo_calibration.observation.noise import noise
 from dlo_calibration.search import Hints, LeastSquares
 from dlo_calibration.search.descent import Descent
 
-STEP = 0.015  # of the finite differences by new parameters, in the unit cube
+STEP = 0.015  # of the finite differences by new parameters, in units of a search
 MOST_COARSE = 6  # evaluations per parameter for a coarse search
 LEAST_SHARE = 0.04  # of the cost: new parameters that explain less cannot lower the error by 2 %
 BEGINNINGS = (0.03, 0.1, 0.3)  # m; bend radii from the best of which a search of locking begins
@@ -202,7 +202,7 @@ class _Ladder:
                                 key=itemgetter(0))
         if cost > (1 - LEAST_SHARE) * here.loss.cost(coarse.model.residuals):
             return None
-        search = LeastSquares(space.dimension, 0, Hints.at(here.point, here.jacobian, coarse=True))
+        search = LeastSquares(space.dimension, 0, Hints.at(here.point, here.jacobian, True, space.upper))
         spent = self._spent
         finest = fit(self._setting, space, search,
                      min(self._budget - spent, MOST_COARSE * space.dimension), first=spent)
@@ -225,7 +225,8 @@ class _Ladder:
         model = _linearised(self._setting, space, start, new)  # of new parameters only
         jacobian = model.jacobian.copy()
         jacobian[:, old] = coarse.model.jacobian - jacobian[:, new] @ nested[new]
-        return space, Descent(start, model.residuals, Huber.of(coarse.model.residuals), jacobian)
+        return space, Descent(start, model.residuals, Huber.of(coarse.model.residuals), jacobian,
+                              upper=space.upper)
 
     def _fold_errors(self, fit: Fit) -> Floats:
         """Return the (f,) mean point error [m] of each fold of the cross-validation."""
@@ -247,25 +248,26 @@ def _linearised(setting: Setting, space: ParameterSpace, point: Floats, columns:
     :raises SimulationError: if the point cannot be simulated.
     :raises CancelledError: when stopped.
     """
-    sides = Differences.one_sided(point, columns, np.where(point > 0.5, -STEP, STEP))
+    sides = Differences.one_sided(point, columns, np.where(point > space.upper / 2, -STEP, STEP))
     here, *beside = setting.evaluate(space).residuals(np.vstack([point, sides.points]))
     if here is None:
         raise SimulationError('the start of the search diverged')
-    return Linearisation(point, here, sides.jacobian(np.zeros((len(here), len(point))), beside, here))
+    jacobian = sides.jacobian(np.zeros((len(here), len(point))), beside, here)
+    return Linearisation(point, here, jacobian, space.upper)
 
 
 def _with_knots(count: int, twist: float, space: ParameterSpace, point: Floats
                 ) -> tuple[ParameterSpace, Floats]:
     shaped, start = space.with_knots(count, point)
     if not space.knots and not math.isnan(twist) and 'clamp_twist' in shaped.free:
-        start[shaped.free.index('clamp_twist')] = BY_NAME['clamp_twist'].value(twist) / SCALE
+        start[shaped.free.index('clamp_twist')] = BY_NAME['clamp_twist'].coordinate(twist)
     return shaped, start
 
 
 def _with_locking(radius: float, space: ParameterSpace, point: Floats) -> tuple[ParameterSpace, Floats]:
     fixed = {name: value for name, value in space.fixed.items() if name != LOCKING}
     return replace(space, free=(*space.free, LOCKING), fixed=fixed), \
-        np.append(point, BY_NAME[LOCKING].value(radius) / SCALE)
+        np.append(point, BY_NAME[LOCKING].coordinate(radius))
 
 
 def _with_parts(count: int, space: ParameterSpace, point: Floats) -> tuple[ParameterSpace, Floats]:

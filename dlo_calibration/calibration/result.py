@@ -34,12 +34,14 @@ from dlo_calibration.inference.uncertainty import (
     verdict,
 )
 from dlo_calibration.model.chain import Floats, frozen_array, interpolate_unseen
-from dlo_calibration.model.parameters import BY_NAME, measured, number, ParameterSpace, SCALE
+from dlo_calibration.model.parameters import BY_NAME, GRAVITY, measured, number, ParameterSpace, SCALE
 from dlo_calibration.model.score import distances, MEAN_DISTANCE, observed, PointErrors
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.noise import NO_NOISE, noise
 
 NOT_USABLE = 'the result is not usable'  # note of its parameters
+#: Bending stiffness over weight and squared length of a DLO that hangs limp, and of one that hardly sags.
+LIMP, RIGID = 0.01, 10.0
 WORST = 0.1  # of the length; good models of real DLOs miss the measured points by 0.3 to 3 % of it
 
 
@@ -115,7 +117,7 @@ class CalibrationResult:
     def of(cls, setting: Setting, prior: Prior, fit: Fit) -> CalibrationResult:
         """Return the result of a fit; `seconds` is 0 until the calibration has ended."""
         trials, best, examination = setting.trials, fit.best, fit.examination
-        uncertainty = spread_of_best(fit.evaluations, best.point)
+        uncertainty = spread_of_best(fit.evaluations, best.point, fit.space.upper)
         if examination is not None:
             uncertainty = examination.uncertainty if examination.regular else uncertainty.of_excited(
                 examination.uncertainty.excited)
@@ -134,16 +136,18 @@ class CalibrationResult:
         Why the parameters should not be used, in one sentence; '' if they can be.
 
         The first of these reasons counts: a trial is implausible; stamps or places of the hands are wrong;
-        the fit is far worse than models of DLOs are; a trial that does not fit the others decides a value,
-        unless it is sensitive; two engines differ by more than the fit misses the measurement; the search
-        ended before a minimum; the fit is not better than the default parameters, though noise does not
-        explain it; the trials determine no parameter.
+        the stiffness may lie beyond its scale; the fit is far worse than models of DLOs are; a trial that
+        does not fit the others decides a value, unless it is sensitive; two engines differ by more than the
+        fit misses the measurement; the search ended before a minimum; the fit is not better than the default
+        parameters, though noise does not explain it; the trials determine no parameter.
         """
         mean, examination, other = self.errors.mean, self.examination, self.confirmation
         if self.implausible:
             return self.implausible[0]
         if self.hand_error:
             return self.hand_error
+        if self._beyond_scale:
+            return self._beyond_scale
         if mean > WORST * self.length:
             return (f'the mean error is {number(100 * mean / self.length)} % of the length; check frames, '
                     'grips and clocks')
@@ -166,6 +170,29 @@ class CalibrationResult:
                 f'next, {self.advice.words}'
             return f'these trials determine none of the parameters; {remedy}'
         return ''
+
+    @cached_property
+    def _beyond_scale(self) -> str:
+        """Why the stiffness of a very short and light, or a very long and heavy DLO may lack, in words."""
+        examination, name = self.examination, 'flexibility'
+        if examination is None or examination.noise_alone or name not in self.space.free or \
+                'mass' in self.space.free:
+            return ''
+        parameter, mass = BY_NAME[name], self.physical()['mass']
+        limp = self.values[name] > 0
+        if self.estimates[name].upper < SCALE if limp else not (
+                examination.uncertainty.at_bound[self.space.free.index(name)]):
+            return ''
+        end = parameter.at_hundred if limp else parameter.at_zero
+        share = end / (mass * GRAVITY * self.length**2)
+        power = math.ceil(math.log10(share / LIMP)) if limp else math.floor(math.log10(share / RIGID))
+        factor = 10.0**power
+        if (factor <= 1) == limp:  # the scale contains all that such a DLO may be
+            return ''
+        whose, by = ('its own', f'{factor:g}') if self.space.mass_known else ('what is assumed', 'its weight')
+        return (f'flexibility may lie beyond the end of its scale, {measured(end, parameter.unit)}: give a '
+                f'mass of {number(factor * mass)} kg, {factor:g} times {whose}, and divide all stiffnesses '
+                f'by {by}, as motion tells only their ratio to the weight')
 
     @property
     def headline(self) -> str:
@@ -226,7 +253,7 @@ class CalibrationResult:
                 f'leave it out (--without {odd.number})')
 
     def including(self, point: Floats) -> CalibrationResult:
-        """Return a result whose intervals contain a (d,) point of the unit cube as well."""
+        """Return a result whose intervals contain a (d,) point of the box as well."""
         assert self.examination is not None
         uncertainty = self.examination.uncertainty
         uncertainty = uncertainty.within(np.minimum(uncertainty.lower, point),
@@ -269,8 +296,8 @@ class CalibrationResult:
 
     @property
     def std(self) -> Floats:
-        """(d,) standard deviations of the found values, in the unit cube."""
-        return np.array([self.estimates[name].std for name in self.space.free]) / SCALE
+        """(d,) standard deviations of the found values, in units of a search."""
+        return self.space.point({name: self.estimates[name].std for name in self.space.free})
 
     @property
     def errors(self) -> PointErrors:
@@ -320,9 +347,10 @@ def parameter_estimates(space: ParameterSpace, best: Evaluation, uncertainty: Un
     :param guessed: names of the parameters whose default was estimated from the chains alone.
     """
     parameters = {}
+    columns = [space.values(each) for each in (best.point, uncertainty.lower, uncertainty.upper,
+                                               uncertainty.std)]
     for k, name in enumerate(space.free):
-        value, lower, upper = (float(x) * SCALE for x in (
-            best.point[k], uncertainty.lower[k], uncertainty.upper[k]))
+        value, lower, upper, std = (column[name] for column in columns)
         (at_value, unit), (at_lower, _), (at_upper, _) = (
             space.reported(name, x) for x in (value, lower, upper))
         note = ''
@@ -338,7 +366,7 @@ def parameter_estimates(space: ParameterSpace, best: Evaluation, uncertainty: Un
             if uncertainty.at_bound[k]:
                 note += ', where the best value is'
         parameters[name] = ParameterEstimate(
-            name, value, float(uncertainty.std[k]) * SCALE, lower, upper, at_value, low, high, unit,
+            name, value, std, lower, upper, at_value, low, high, unit,
             own_verdict == IDENTIFIABLE, own_verdict, note)
     return parameters
 
@@ -351,7 +379,7 @@ def hand_estimates(setting: Setting) -> dict[str, ParameterEstimate]:
         scale = SCALE / (parameter.at_hundred - parameter.at_zero)
         low, high = (at + side * DEVIATIONS * deviations[name] for side in (-1, 1))
         value, lower, upper = map(parameter.value, (at, low, high))
-        words = verdict(lower / SCALE, upper / SCALE)
+        words = verdict(*(each / SCALE * parameter.extent for each in (lower, upper, SCALE)))
         estimates[name] = ParameterEstimate(
             name, value, deviations[name] * scale, lower, upper, at, low, high, parameter.unit,
             words == IDENTIFIABLE, words, 'as the chains show it, without simulation')
@@ -426,8 +454,7 @@ def plain(result: CalibrationResult) -> dict[str, Any]:
         'noise_m': examination and examination.noise,
         'residual_std_m': examination and examination.uncertainty.residual,
         'correlations': result.correlations,
-        'advice': advice and {**asdict(advice), **{key: getattr(advice, key) * SCALE for key in (
-            'std', 'expected_std', 'lower', 'upper')}},
+        'advice': advice and {**asdict(advice), **advice.of_hundred},
         'explanations': {missing.name: missing.share for missing in result.missing_parameters},
         'undetermined': result.undetermined,
         'together': [{**asdict(pair), 'words': pair.words} for pair in result.together],

@@ -99,16 +99,16 @@ def _examined(setting: Setting, fit: Fit, discretised: bool) -> tuple[Examinatio
             best.point, best.residuals, ResidualLayout.compared(trials), evaluate.residuals,
             default=default, noise=sigma, finer=fine, starts=starts, hands=hands,
             restarted=[restart.residuals for restart in restarts],
-            fading=np.array([name not in REST_SHAPE for name in space.free]))
+            fading=np.array([name not in REST_SHAPE for name in space.free]), upper=space.upper)
     finally:
         if finer is not None:
             finer.simulator.close()
     uncertainty, jacobian = examination.uncertainty, examination.jacobian
     point, again = np.where(uncertainty.excited, best.point, default), best
     if not np.array_equal(point, best.point):
-        model = Linearisation(best.point, best.residuals, jacobian).at(point)
+        model = Linearisation(best.point, best.residuals, jacobian, space.upper).at(point)
         step = np.clip(_step(model, uncertainty), -0.1, 0.1)
-        points = np.stack([point, np.clip(point + step, 0.0, 1.0)])
+        points = np.stack([point, np.clip(point + step, 0.0, space.upper)])
         seen = list(evaluate(points, best.index))
         if len(seen) < len(points):
             raise CancelledError
@@ -121,7 +121,8 @@ def _examined(setting: Setting, fit: Fit, discretised: bool) -> tuple[Examinatio
             again = best
             uncertainty = replace(uncertainty, excited=uncertainty.excited | (point != best.point))
     assert again.residuals is not None
-    remaining = _step(Linearisation(again.point, again.residuals, jacobian), examination.uncertainty)
+    remaining = _step(Linearisation(again.point, again.residuals, jacobian, space.upper),
+                      examination.uncertainty)
     return replace(examination, uncertainty=uncertainty.at(best.point, again.point, remaining)), again
 
 
@@ -132,11 +133,11 @@ def _with_hand(space: ParameterSpace, setting: Setting, name: str) -> ParameterS
 
 
 def _step(fit: Linearisation, uncertainty: Uncertainty) -> Floats:
-    """Return the (d,) Gauss-Newton step of the excited parameters, within the unit cube."""
+    """Return the (d,) Gauss-Newton step of the excited parameters, within the box."""
     step = np.zeros(len(fit.point))
     free = fit.columns(uncertainty.excited).weighted(Huber.of(fit.residuals).roots(fit.residuals))
     step[uncertainty.excited] = free.step(np.eye(len(free.point)) * uncertainty.residual**2)
-    return np.asarray(np.clip(fit.point + step, 0.0, 1.0) - fit.point)
+    return np.asarray(np.clip(fit.point + step, 0.0, fit.upper) - fit.point)
 
 
 def with_outlier(setting: Setting, result: CalibrationResult) -> CalibrationResult:
@@ -147,7 +148,7 @@ def with_outlier(setting: Setting, result: CalibrationResult) -> CalibrationResu
         return result
     others = replace(setting, trials=(*trials[:k], *trials[k + 1:]), on_evaluation=lambda _: None)
     search = LeastSquares(space.dimension, setting.options.seed,
-                          Hints(point, result.examination.uncertainty.excited))
+                          Hints(point, result.examination.uncertainty.excited, upper=space.upper))
     try:
         without = fit(others, space, search, budget(space.dimension)).best
         evaluation = setting.simulated(space, without)

@@ -27,7 +27,7 @@ class Evaluation:
     One parameter set tried on all trials (the paper calls it a round).
 
     :param index: 0, 1, ... in the order in which the search asked.
-    :param point: (d,) in the unit cube.
+    :param point: (d,) in the box.
     :param values: free parameters on the 0..100 scale.
     :param scores: difference score of each trial [cm]; empty if the evaluation failed.
     :param errors: over all points of all goals; None if the evaluation failed.
@@ -101,11 +101,11 @@ class Evaluator:
         return ResidualLayout.of(self.trials) if self._rows is None else ResidualLayout.compared(self.trials)
 
     def evaluate(self, index: int, point: Floats) -> Evaluation:
-        """Try a (d,) point of the unit cube on every trial, in this thread."""
+        """Try a (d,) point of the box on every trial, in this thread."""
         return self.evaluated(index, point, simulate_all(self.simulator, self.jobs(point), Stop()))
 
     def jobs(self, point: Floats) -> list[Job]:
-        """Return the jobs of a (d,) point of the unit cube, one for each trial."""
+        """Return the jobs of a (d,) point of the box, one for each trial."""
         physical = self.space.physical(self.space.values(point), self._length)
         own = {session: of_session(physical, session)
                for session in sorted({trial.session for trial in self.trials})}

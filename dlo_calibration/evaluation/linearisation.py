@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Linearisation: how residuals change with the parameters near a point of the unit cube."""
+"""Linearisation: how residuals change with the parameters near a point of the box of a search."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from operator import itemgetter
 from typing import Iterable, Sequence, Union
@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 
 from dlo_calibration.model.chain import Floats
 
-# Steps of finite differences, in the unit cube:
+# Steps of finite differences, in units of a search:
 STEP = 0.03  # usual; over shorter ones, contacts that come and go dominate the residuals
 WIDEST = 0.25  # largest, for parameters of large uncertainty; beyond it, the linear model does not hold
 TINY = float(np.finfo(float).tiny)  # keeps a divisor above zero
 
+Ends = Union[Floats, float]  # of the box in each parameter, or of all
 Rows = Union[slice, NDArray[np.intp]]  # of a Jacobian: those of one or several trials
 Columns = Union[Sequence[int], NDArray[np.intp]]  # of a Jacobian: indices
 
@@ -29,14 +30,16 @@ class Linearisation:
     """
     A linear model of the residuals near a point.
 
-    :param point: (d,) in the unit cube.
+    :param point: (d,) in the box.
     :param residuals: (m,) [m] at that point.
-    :param jacobian: (m, d) derivatives of the residuals by the parameters [m per unit cube].
+    :param jacobian: (m, d) derivatives of the residuals by the parameters [m per unit].
+    :param upper: (d,) upper ends of the box, or one for all; the lower ones are 0.
     """
 
     point: Floats
     residuals: Floats
     jacobian: Floats
+    upper: Ends = 1.0
 
     @property
     def information(self) -> Floats:
@@ -55,15 +58,16 @@ class Linearisation:
 
     def weighted(self, weights: Floats) -> Linearisation:
         """Return the model with each residual and its derivatives multiplied by its weight, (m,)."""
-        return Linearisation(self.point, weights * self.residuals, weights[:, None] * self.jacobian)
+        return replace(self, residuals=weights * self.residuals, jacobian=weights[:, None] * self.jacobian)
 
     def rows(self, rows: Rows) -> Linearisation:
         """Return the model of the residuals in some rows."""
-        return Linearisation(self.point, self.residuals[rows], self.jacobian[rows])
+        return replace(self, residuals=self.residuals[rows], jacobian=self.jacobian[rows])
 
     def columns(self, columns: NDArray[np.intp] | NDArray[np.bool_]) -> Linearisation:
         """Return the model in some of the parameters; the others are fixed."""
-        return Linearisation(self.point[columns], self.residuals, self.jacobian[:, columns])
+        upper = np.broadcast_to(self.upper, self.point.shape)[columns]
+        return Linearisation(self.point[columns], self.residuals, self.jacobian[:, columns], upper)
 
     def predicted(self, step: Floats) -> Floats:
         """Return the (m,) residuals [m] after a (d,) step."""
@@ -71,7 +75,7 @@ class Linearisation:
 
     def at(self, point: Floats) -> Linearisation:
         """Return the model around another (d,) point, with the residuals that this model predicts there."""
-        return Linearisation(point, self.predicted(point - self.point), self.jacobian)
+        return replace(self, point=point, residuals=self.predicted(point - self.point))
 
     def step(self, prior: Floats | None = None) -> Floats:
         """
@@ -138,12 +142,12 @@ class Differences:
         return cls(point, columns, [row[None] for row in beside])
 
     @classmethod
-    def central(cls, point: Floats, columns: Columns, steps: Floats) -> Differences:
-        """Return central differences: two points for each of k parameters, within the unit cube."""
-        pairs = []
+    def central(cls, point: Floats, columns: Columns, steps: Floats, upper: Ends = 1.0) -> Differences:
+        """Return central differences: two points for each of k parameters, within the box up to `upper`."""
+        pairs, ends = [], np.broadcast_to(upper, point.shape)
         for k in columns:
             pairs.append(np.stack([point, point]))
-            pairs[-1][:, k] = np.clip(point[k] + np.array([-steps[k], steps[k]]), 0.0, 1.0)
+            pairs[-1][:, k] = np.clip(point[k] + np.array([-steps[k], steps[k]]), 0.0, ends[k])
         return cls(point, columns, pairs)
 
     @property

@@ -289,7 +289,7 @@ class EvaluatorMemory:
         self._size = evaluator.layout.rows[-1].stop
 
     def find(self, index: int, point: Floats) -> Evaluation | None:
-        """Return the evaluation of a (d,) point of the unit cube; None if there is none."""
+        """Return the evaluation of a (d,) point of the box; None if there is none."""
         entry = self._memory.find(self._key(point)) if self._base else None
         if entry is None:
             return None

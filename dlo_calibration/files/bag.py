@@ -21,6 +21,7 @@ from typing import Any, Callable, Iterable, Mapping
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.record import decode, Record
 from dlo_calibration.messages.codec import INITIAL, INPUT_TYPES, NANOSECONDS, OUTPUT_TYPES
+from dlo_calibration.model.parameters import from_first_scale, SCALE
 
 USED_TYPES: Mapping[str, str] = {**INPUT_TYPES, **OUTPUT_TYPES}
 
@@ -66,6 +67,7 @@ class Bag:
         self._unpacked = 0
         self._marks: list[tuple[str, int]] = []  # each mark, and the number of records before it
         self._options: str | None = None  # the last recorded ones
+        self._scales = ''  # version of the scales in them; the first wrote none
         self._left_out: set[str] = set()  # topics
         self._dropped = '{}'  # the last count of messages that the recording node dropped, as JSON
 
@@ -123,7 +125,8 @@ class Bag:
 
     def take_entries(self, entries: Mapping[str, str]) -> None:
         """Take the entries of one of our own metadata records."""
-        self._options = entries.get('options', self._options)
+        if 'options' in entries:
+            self._options, self._scales = entries['options'], entries.get('scales', '')
         if 'mark' in entries:
             self._marks.append((entries['mark'], len(self.records)))
         if 'dropped' in entries:
@@ -136,6 +139,9 @@ class Bag:
         with suppress(ValueError, RecursionError):
             options = json.loads(self._options[:OPTIONS_SIZE])
             if isinstance(options, dict):
+                value = options.get('flexibility')
+                if not self._scales and isinstance(value, (int, float)) and 0 <= value <= SCALE:
+                    options['flexibility'] = from_first_scale(value)
                 return options
         self.warnings.append('recorded options that cannot be read are left out')
         return None

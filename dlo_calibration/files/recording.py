@@ -25,6 +25,7 @@ from ruamel.yaml import YAML
 from dlo_calibration.calibration.options import recordable
 from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.files.record import Record, typestore
+from dlo_calibration.model.parameters import SCALES
 from dlo_calibration.writing import replacing, whole
 
 OUR_RECORD = 'dlo_calibration'  # name of our metadata records in the MCAP file
@@ -110,7 +111,8 @@ class SessionWriter:
 
     def write_options(self, options: Mapping[str, Any]) -> None:
         """Record the current options, by name, for a replay; those of the machine are left out."""
-        self._write_metadata_record('options', json.dumps(recordable(options), sort_keys=True))
+        self._write_metadata_record('options', json.dumps(recordable(options), sort_keys=True),
+                                    scales=str(SCALES))
 
     def write_mark(self, mark: str) -> None:
         """
@@ -166,10 +168,10 @@ class SessionWriter:
                 self._stream.close()
             raise RecordingError(self.failure) from error
 
-    def _write_metadata_record(self, key: str, text: str) -> None:
+    def _write_metadata_record(self, key: str, text: str, **more: str) -> None:
         with self._disk():
             self._writer.flush()
-            self._writer.add_metadata(OUR_RECORD, {key: text})
+            self._writer.add_metadata(OUR_RECORD, {key: text, **more})
             self._writer.flush()
 
     def _add_channel(self, topic: str, message_type: str) -> None:

@@ -31,6 +31,7 @@ from dlo_calibration.model.named_actions import (
     NamedAction,
     TimedAction,
 )
+from dlo_calibration.model.parameters import SCALES
 from dlo_calibration.model.pose import Pose
 from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.writing import write_file
@@ -186,7 +187,7 @@ class Request:
     @cached_property
     def document(self) -> bytes:
         """The request as an XML document in UTF-8."""
-        root = xml.new_root('calibration_request', version=1)
+        root = xml.new_root('calibration_request', version=SCALES)
         options = self.file_options.values
         settings = {name: value for name, value in options.items() if name != 'mass'}
         xml.add(root, 'object', name=self.name, mass=options.get('mass'))

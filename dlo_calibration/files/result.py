@@ -25,7 +25,7 @@ from dlo_calibration.calibration.result import CalibrationResult, evaluation_row
 from dlo_calibration.files import xml
 from dlo_calibration.inference.examination import Confirmation
 from dlo_calibration.model.chain import Chain
-from dlo_calibration.model.parameters import ParameterSpace, SCALE
+from dlo_calibration.model.parameters import ParameterSpace, SCALE, SCALES
 from dlo_calibration.model.score import PointErrors
 from dlo_calibration.writing import whole, write_file
 
@@ -121,7 +121,7 @@ def description_document(result: CalibrationResult | Description,
     """Return the definition of a DLO as an XML document in UTF-8."""
     dlo = result if isinstance(result, Description) else Description.of(result, options, passport)
     space = dlo.space
-    root = xml.new_root('dlo', version=1, mass=dlo.mass, length=dlo.length)
+    root = xml.new_root('dlo', version=SCALES, mass=dlo.mass, length=dlo.length)
     xml.add_points(xml.add(root, 'chain'), dlo.chain)
     parameters = xml.add(root, 'parameters')
     for estimate in dlo.parameters.values():

@@ -32,7 +32,7 @@ from dlo_calibration import reading
 from dlo_calibration.calibration.options import file_options, FileOptions, Options, recordable
 from dlo_calibration.errors import InputError, suggestion
 from dlo_calibration.model.chain import Chain, Floats
-from dlo_calibration.model.parameters import exact
+from dlo_calibration.model.parameters import exact, from_first_scale, owner, SCALE
 
 SCHEMAS = Path(__file__).parent / 'schema'
 MAXIMUM_SIZE = 32 * 2**20  # bytes; more than any real request needs, and small enough for the memory
@@ -93,7 +93,25 @@ def parse(octets: bytes, where: str, schema: str) -> Any:
         raise refused(where, root, f'the root element <{root.tag}>', f'<{schema}>', f'name a <{schema}> file')
     if not checker.validate(root):
         raise _schema_error(where, checker.error_log[0], schema)
+    if root.get('version') == '1':
+        _upgrade(root)
     return root
+
+
+def _upgrade(root: Any) -> None:
+    """Bring the flexibility in a document of version 1 to today's scale."""
+    start = from_first_scale(0.0)
+    for element in root.iter('found', 'fixed', 'option'):
+        if owner(element.get('name'))[0] != 'flexibility':
+            continue
+        for name in ('value', 'lower', 'upper', 'std'):
+            with suppress(TypeError, ValueError):  # it is absent, or refused as it is
+                value = float(element.get(name))
+                if name == 'std':
+                    element.set(name, exact(from_first_scale(value) - start))
+                elif 0 <= value <= SCALE and (name, value) != ('lower', 0.0):
+                    # An interval that reached the end of the scale is open there, and stays so.
+                    element.set(name, exact(from_first_scale(value)))
 
 
 def document(root: Any) -> bytes:

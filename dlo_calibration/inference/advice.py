@@ -35,7 +35,7 @@ from dlo_calibration.inference.uncertainty import DEVIATIONS, IDENTIFIABLE_WIDTH
 from dlo_calibration.model.action import Action
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.named_actions import Drag, GraspAndPlace, LiftAndHold, NamedAction, TwoHands
-from dlo_calibration.model.parameters import ParameterSpace
+from dlo_calibration.model.parameters import BY_NAME, number, ParameterSpace, SCALE
 from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.observation.excitation import excites
 
@@ -60,9 +60,9 @@ class Advice:
     :param action: its name, as in a request.
     :param words: what to do.
     :param parameter: the name of the parameter.
-    :param std: its present standard deviation in the unit cube.
+    :param std: its present standard deviation in units of a search.
     :param expected_std: its expected standard deviation after the action was observed.
-    :param lower: lower end of the expected 90 % interval in the unit cube, around the present value;
+    :param lower: lower end of the expected 90 % interval in the box, around the present value;
         `upper` is its upper end.
     """
 
@@ -73,6 +73,12 @@ class Advice:
     expected_std: float
     lower: float
     upper: float
+
+    @property
+    def of_hundred(self) -> dict[str, float]:
+        """The standard deviations and the interval on the 0..100 scale."""
+        scale = SCALE / BY_NAME[self.parameter].extent
+        return {key: getattr(self, key) * scale for key in ('std', 'expected_std', 'lower', 'upper')}
 
 
 def advise(trials: Sequence[Trial], space: ParameterSpace, pool: Pool, point: Floats,
@@ -85,7 +91,7 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, pool: Pool, point: Fl
     and what is known only together with it, is varied at first; the others are varied for the three best
     actions alone.
 
-    :param point: (d,) the found values in the unit cube.
+    :param point: (d,) the found values in the box.
     :param uncertainty: of the parameters now.
     :param length: of the DLO [m].
     :return: None if no action helps, every parameter is identifiable, or there is no covariance.
@@ -137,9 +143,9 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, pool: Pool, point: Fl
                     best = std, candidate
         if best is not None:
             std, candidate = best
-            reach = DEVIATIONS * std
+            reach, end = DEVIATIONS * std, float(space.upper[k])
             return Advice(candidate.action, candidate.words, space.free[k], now, std,
-                          max(0.0, float(point[k]) - reach), min(1.0, float(point[k]) + reach))
+                          max(0.0, float(point[k]) - reach), min(end, float(point[k]) + reach))
     return None
 
 
@@ -147,12 +153,12 @@ def sensitivities(trials: Sequence[Trial], space: ParameterSpace, pool: Pool, po
                   length: float, *, shown: NDArray[np.bool_], at_rest: bool = True,
                   recorded: bool = False) -> list[Floats | SimulationError]:
     """
-    Return the (m, d) derivatives of the simulated chains of each trial [m per unit cube].
+    Return the (m, d) derivatives of the simulated chains of each trial [m per unit].
 
     The central differences have steps of the standard deviations, because the chains may be nonlinear within
     such a distance.
 
-    :param std: (d,) standard deviations in the unit cube.
+    :param std: (d,) standard deviations in units of a search.
     :param length: of the DLO [m].
     :param shown: (trials, d) False for parameters that a trial cannot show: their columns are zero without a
         rollout.
@@ -163,7 +169,7 @@ def sensitivities(trials: Sequence[Trial], space: ParameterSpace, pool: Pool, po
     :raises CancelledError: when stopped.
     """
     steps = np.clip(std, STEP, WIDEST)
-    sides = [Differences.central(point, np.flatnonzero(row), steps) for row in shown]
+    sides = [Differences.central(point, np.flatnonzero(row), steps, space.upper) for row in shown]
     jobs = []
     for trial, differences in zip(trials, sides, strict=True):
         for beside in differences.points:
@@ -195,12 +201,12 @@ def candidates(trials: Sequence[Trial]) -> Iterator[Candidate]:
         across = np.array([0.0, 1.0, 0.0])
     side = tuple((across / np.linalg.norm(across)).tolist())
     gap = float(np.linalg.norm(along))
-    cm = f'{30 * length:.0f} cm'
+    cm = _centimetres(0.3 * length)
     for fraction, place in ((0.0, 'the first end'), (0.5, 'the middle')):
         height = 0.4 * length
-        yield from _candidate(f'lift {place} by {100 * height:.0f} cm and hold it', chain,
+        yield from _candidate(f'lift {place} by {_centimetres(height)} and hold it', chain,
                               LiftAndHold(fraction=fraction, height=height))
-        yield from _candidate(f'lift {place} by {100 * height:.0f} cm and watch it while it moves', chain,
+        yield from _candidate(f'lift {place} by {_centimetres(height)} and watch it while it moves', chain,
                               LiftAndHold(fraction=fraction, height=height, speed=0.5), watched=True)
     for fraction, place in ((0.0, 'the first end'), (0.25, 'a quarter of the length'), (0.5, 'the middle')):
         yield from _candidate(f'drag {place} sideways by {cm}', chain,
@@ -212,13 +218,17 @@ def candidates(trials: Sequence[Trial]) -> Iterator[Candidate]:
         GraspAndPlace(fraction=0.0, to=_beyond(chain, 0.7, across)))
     if gap < 0.05 * length:
         return  # the ends touch each other, so that no direction is defined
-    yield from _candidate(f'grip both ends and push them {100 * gap / 3:.0f} cm together', chain,
+    yield from _candidate(f'grip both ends and push them {_centimetres(gap / 3)} together', chain,
                           TwoHands(fractions=(0.0, 1.0), motion='together', distance=gap / 3))
     stretch = 1.03 * length - gap
     if stretch > 0:
         yield from _candidate(
-            f'grip both ends and pull them {100 * stretch:.0f} cm apart, 3 % beyond the straight DLO', chain,
+            f'grip both ends and pull them {_centimetres(stretch)} apart, 3 % beyond the straight DLO', chain,
             TwoHands(fractions=(0.0, 1.0), motion='apart', distance=stretch))
+
+
+def _centimetres(length: float) -> str:
+    return f'{number(float(f"{100 * length:.2g}"))} cm'
 
 
 def _beyond(chain: Chain, fraction: float, across: Floats) -> tuple[float, ...]:

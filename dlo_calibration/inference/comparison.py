@@ -25,7 +25,7 @@ KNOWN_STD = WEAK_WIDTH / (2 * DEVIATIONS)  # a direction in which both know less
 @dataclass(frozen=True)
 class Comparison:
     """
-    The difference of d parameters between two calibrations, in the unit cube.
+    The difference of d parameters between two calibrations, in units of a search.
 
     :param change: (d,) later minus earlier values; `std` (d,) their standard deviations.
     :param changed: (d,) True for the fewest parameters whose changes explain the difference; all but the
@@ -54,7 +54,7 @@ def compare(change: Floats, before: Floats, after: Floats) -> Comparison:
     """
     Compare two calibrations.
 
-    Directions of the unit cube in which the difference is hardly known do not count, so that EI and friction
+    Directions of the box in which the difference is hardly known do not count, so that EI and friction
     can be compared where only both together are known.
 
     :param change: (d,) later minus earlier values.

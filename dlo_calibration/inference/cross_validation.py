@@ -20,7 +20,7 @@ MOST_FOLDS = 8
 CHANCE = 0.015  # false positive rate of each test
 LEAST_GAIN = 0.02  # mean reduction of the logarithm of the error
 
-#: Takes (k, d) points of the unit cube, returns their residuals (m,) [m], None for a failure.
+#: Takes (k, d) points of the box, returns their residuals (m,) [m], None for a failure.
 Evaluate = Callable[[Floats], Sequence[Floats | None]]
 
 
@@ -45,7 +45,7 @@ def left_out_errors(model: Linearisation, layout: ResidualLayout, residuals_at: 
     errors = [distances(model.residuals[rows]) for rows in folds]
     unsure = list(range(len(folds)))
     for shorter in (1.0, 0.5, 0.25):
-        points = np.clip(model.point + shorter * steps[unsure], 0.0, 1.0)
+        points = np.clip(model.point + shorter * steps[unsure], 0.0, model.upper)
         worse = []
         for k, residuals in zip(unsure, residuals_at(points), strict=True):
             others = np.delete(np.arange(len(model.residuals)), folds[k])

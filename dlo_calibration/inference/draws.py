@@ -11,6 +11,7 @@ import numpy as np
 
 from dlo_calibration.inference.uncertainty import Uncertainty
 from dlo_calibration.model.chain import Floats
+from dlo_calibration.search.protocol import spread
 
 EDGE = 0.05  # from the ends of the scale, where no draw lies
 
@@ -19,12 +20,13 @@ def drawn_points(point: Floats, uncertainty: Uncertainty, count: int, seed: int)
     """
     Return draws, (count, d), of what is known: a Latin hypercube, so that few draws cover each parameter.
 
-    :param point: (d,) the best values in the unit cube; a parameter of which nothing is known does not keep
-        to its value.
+    :param point: (d,) the best values in the box; a parameter of which nothing is known is drawn
+        from one unit around its value.
     """
     generator = np.random.default_rng(seed)
     shares = (np.argsort(generator.random((count, len(point))), axis=0) + 0.5) / count
     normal = np.vectorize(NormalDist().inv_cdf)(shares)
     values, axes = np.linalg.eigh(uncertainty.spread)
     drawn = point + normal @ (axes * np.sqrt(np.maximum(values, 0.0))).T
-    return np.clip(np.where(uncertainty.unknown, shares, drawn), EDGE, 1 - EDGE)
+    return np.clip(np.where(uncertainty.unknown, spread(point, uncertainty.ends, shares), drawn), EDGE,
+                   uncertainty.ends - EDGE)

@@ -18,7 +18,7 @@ from typing import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_calibration.evaluation.linearisation import Differences, Linearisation, STEP, WIDEST
+from dlo_calibration.evaluation.linearisation import Differences, Ends, Linearisation, STEP, WIDEST
 from dlo_calibration.evaluation.residuals import Huber, ResidualLayout
 from dlo_calibration.inference.cross_validation import Evaluate, left_out_errors
 from dlo_calibration.inference.uncertainty import (
@@ -39,7 +39,8 @@ AMONG_OBSTACLES = 6.0  # times that; PyBullet's contact with them is off by 2 mm
 #: Returns the residuals (m,) [m] of points that are being evaluated, None for a failure.
 Pending = Callable[[], Sequence[Floats | None]]
 
-#: Standard deviation (unit cube) above which a small step is not enough: contact and friction have kinks.
+#: Standard deviation, in units of a search, above which a small step is not enough: contact and friction have
+#: kinks.
 SUSPECT = 0.01
 #: A step of so many standard deviations shows what happens there, if it is not shorter than SHORTEST.
 NEARBY, SHORTEST = 4.0, 0.003
@@ -53,7 +54,7 @@ class Examination:
     The outcome of an examination.
 
     :param uncertainty: of the parameters.
-    :param jacobian: (m, d) derivative of the residuals at the compared goals [m per unit cube].
+    :param jacobian: (m, d) derivative of the residuals at the compared goals [m per unit].
     :param regular: False if the search has not reached a minimum, so that `uncertainty` is not valid.
     :param noise: noise level: standard deviation of one measured coordinate, from the roughness of the
         chains [m]; nan if they have too few points.
@@ -79,9 +80,10 @@ class Examination:
 def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: Evaluate, *,
             default: Floats, noise: float, finer: Pending | None = None,
             starts: Sequence[Pending] = (), restarted: Sequence[Evaluate] = (),
-            hands: Sequence[Pending] = (), fading: NDArray[np.bool_] | None = None) -> Examination:
+            hands: Sequence[Pending] = (), fading: NDArray[np.bool_] | None = None, upper: Ends = 1.0
+            ) -> Examination:
     """
-    Examine the (d,) `point` of the unit cube, where the residuals are `residuals` (m,) [m].
+    Examine the (d,) `point` of the box, where the residuals are `residuals` (m,) [m].
 
     :param evaluate: simulates the trials.
     :param default: (d,) the default parameters.
@@ -92,6 +94,7 @@ def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: 
     :param hands: each returns those with an error of the hands that is larger by its standard deviation.
     :param fading: (d,) False for parameters whose effect is much the same along their scale; None: all may
         fade or have kinks.
+    :param upper: (d,) upper ends of the box, or one for all; the lower ones are 0.
     """
     count = 0
 
@@ -102,7 +105,7 @@ def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: 
 
     at_default, = residuals_at(default[None, :])
     fading = np.ones(len(point), bool) if fading is None else fading
-    fit = _linearised(point, residuals, layout, residuals_at, noise, fading)
+    fit = _linearised(point, residuals, layout, residuals_at, noise, fading, upper)
     fold_errors = left_out_errors(fit, layout, residuals_at)
     shift = None
     if finer is not None:
@@ -130,14 +133,14 @@ def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: 
 
 
 def _linearised(point: Floats, residuals: Floats, layout: ResidualLayout, residuals_at: Evaluate,
-                noise: float, fading: NDArray[np.bool_]) -> Linearisation:
+                noise: float, fading: NDArray[np.bool_], upper: Ends) -> Linearisation:
     """Return the linear model of the residuals; uncertain parameters take wide steps, certain ones short."""
-    dimension = len(point)
+    dimension, middle = len(point), np.broadcast_to(upper, point.shape) / 2
 
     def measured(columns: Sequence[int], steps: Floats) -> Floats:
-        sides = Differences.central(point, columns, steps)
+        sides = Differences.central(point, columns, steps, upper)
         # One side, the one towards the middle, shows an effect that is much the same along the scale.
-        beside = [both if fading[k] else both[[int(point[k] < 0.5)]]
+        beside = [both if fading[k] else both[[int(point[k] < middle[k])]]
                   for k, both in zip(columns, sides.beside, strict=True)]
         sides = replace(sides, beside=beside)
         return sides.jacobian(np.zeros((len(residuals), dimension)), residuals_at(sides.points), residuals)
@@ -145,7 +148,7 @@ def _linearised(point: Floats, residuals: Floats, layout: ResidualLayout, residu
     steps = np.full(dimension, STEP)
     jacobian = measured(range(dimension), steps)
     for _ in range(2):
-        std = at_minimum(Linearisation(point, residuals, jacobian), layout, noise=noise).std
+        std = at_minimum(Linearisation(point, residuals, jacobian, upper), layout, noise=noise).std
         wanted = np.where(std > SUSPECT, np.clip(std, 0.1, WIDEST), np.clip(NEARBY * std, SHORTEST, STEP))
         other = (fading & (wanted > 1.5 * steps)) | (1.5 * wanted < steps)
         columns = np.flatnonzero(other).tolist()
@@ -157,7 +160,7 @@ def _linearised(point: Floats, residuals: Floats, layout: ResidualLayout, residu
             # A short step may see a kink, a long one a slope that is not here: the smaller effect counts.
             if np.linalg.norm(again[:, k]) < np.linalg.norm(jacobian[:, k]):
                 jacobian[:, k] = again[:, k]
-    return Linearisation(point, residuals, jacobian)
+    return Linearisation(point, residuals, jacobian, upper)
 
 
 def extended(fit: Linearisation, uncertainty: Uncertainty, residuals_at: Evaluate,
@@ -169,11 +172,12 @@ def extended(fit: Linearisation, uncertainty: Uncertainty, residuals_at: Evaluat
     An end whose effect is below 90 % of the expected one moves to twice its distance, four times at most;
     after that, it is the end of the scale.  The standard deviations grow with the intervals.
     """
-    point, ends, limits = fit.point, np.stack([uncertainty.lower, uncertainty.upper]), (0.0, 1.0)
+    point, ends = fit.point, np.stack([uncertainty.lower, uncertainty.upper])
+    limits = np.stack([np.zeros(len(point)), np.broadcast_to(fit.upper, len(point))])
     excited = np.flatnonzero(uncertainty.excited)
     needed = DEVIATIONS * uncertainty.std * 0.9
     unsure = [(side, int(k)) for k in excited for side in (0, 1)
-              if uncertainty.std[k] > SUSPECT and ends[side, k] != limits[side] and fading[k]]
+              if uncertainty.std[k] > SUSPECT and ends[side, k] != limits[side, k] and fading[k]]
     for _ in range(4):
         if not unsure:
             break
@@ -186,12 +190,12 @@ def extended(fit: Linearisation, uncertainty: Uncertainty, residuals_at: Evaluat
                 continue
             own = fit.columns(excited).own_weights(int(np.searchsorted(excited, k)))
             if abs(float(own @ (residuals - fit.residuals))) < needed[k]:
-                ends[side, k] = np.clip(2 * ends[side, k] - point[k], *limits)
-                if ends[side, k] != limits[side]:
+                ends[side, k] = np.clip(2 * ends[side, k] - point[k], *limits[:, k])
+                if ends[side, k] != limits[side, k]:
                     moved.append((side, k))
         unsure = moved
     for side, k in unsure:
-        ends[side, k] = limits[side]
+        ends[side, k] = limits[side, k]
     return uncertainty.within(ends[0], ends[1])
 
 
@@ -213,9 +217,9 @@ def scattered(fit: Linearisation, uncertainty: Uncertainty, elsewhere: Sequence[
     if not elsewhere or not len(certain):
         return uncertainty, 0
     loss, point = Huber.of(fit.residuals), fit.point
-    points = np.tile(point, (len(certain), len(ELSEWHERE), 1))
+    points, most = np.tile(point, (len(certain), len(ELSEWHERE), 1)), np.broadcast_to(fit.upper, point.shape)
     for row, k in zip(points, certain.tolist(), strict=True):
-        row[:, k] = np.clip(point[k] + np.array(ELSEWHERE) * uncertainty.std[k], 0.0, 1.0)
+        row[:, k] = np.clip(point[k] + np.array(ELSEWHERE) * uncertainty.std[k], 0.0, most[k])
     excess = np.zeros(len(point))
     for residuals, restart in elsewhere:
         simulated = restart(points.reshape(-1, len(point)))
@@ -228,7 +232,7 @@ def scattered(fit: Linearisation, uncertainty: Uncertainty, elsewhere: Sequence[
     std = np.sqrt(uncertainty.std**2 + np.maximum(excess, 0.0))
     further = DEVIATIONS * (std - uncertainty.std)
     wider = uncertainty.within(np.maximum(uncertainty.lower - further, 0.0),
-                               np.minimum(uncertainty.upper + further, 1.0))
+                               np.minimum(uncertainty.upper + further, fit.upper))
     return wider, len(elsewhere) * points.shape[0] * points.shape[1]
 
 

@@ -39,13 +39,13 @@ def _changes(trials: Sequence[Trial], others: Sequence[Sequence[Trial]], space: 
     """
     Yield, for each trial at each draw, how its chains change: None if it fails.
 
-    :returns: the derivatives by the parameters, (m, d) [m per unit cube], and the changes by each shared
+    :returns: the derivatives by the parameters, (m, d) [m per unit], and the changes by each shared
         error, (m, e) [m].
     """
     jobs, beside = [], []
     for trial, other, row in zip(trials, others or [()] * len(trials), shown, strict=True):
         for point in points:
-            differences = Differences.central(point, np.flatnonzero(row), steps)
+            differences = Differences.central(point, np.flatnonzero(row), steps, space.upper)
             at, *away = (space.physical(space.values(each), length)
                          for each in (point, *differences.points))
             jobs += [(version, at) for version in (trial, *other)] + [(trial, each) for each in away]

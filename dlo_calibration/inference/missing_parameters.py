@@ -27,7 +27,7 @@ from dlo_calibration.model.parameters import (
 from dlo_calibration.search.descent import bounded_least_squares
 
 PARTS = 'parts'  # stands for parts of different bending stiffness
-MOVE = 0.15  # change of a parameter, in the unit cube: well above the noise of a simulation
+MOVE = 0.15  # change of a parameter, in units of a search: well above the noise of a simulation
 FURTHEST = 2.0  # the effect is extrapolated to this multiple of the change, but no further
 
 
@@ -74,20 +74,20 @@ def missing_parameters(space: ParameterSpace, evaluate: Callable[[ParameterSpace
 
 
 def _candidates(space: ParameterSpace, parts: bool = True) -> Iterator[tuple[str, ParameterSpace, Floats]]:
-    """Yield names, spaces with a more free parameters, and (k, a) values of these in the unit cube to try."""
+    """Yield names, spaces with a more free parameters, and (k, a) values of these in the box to try."""
     for parameter in PARAMETERS:
         name = parameter.name
         if name in space.free or name in (*PART_NAMES, *REST_SHAPE, *HANDS) or _is_idle(name, space):
             continue
         fixed = {key: value for key, value in space.fixed.items() if key != name}
-        now = space.fixed.get(name, parameter.default) / SCALE
+        now = space.fixed.get(name, parameter.default) / SCALE * parameter.extent
         # At the lower end of a logarithmic scale, such an effect is absent.
         step = 0.5 if parameter.neutral == 0 and not parameter.linear and now == 0 else MOVE
         yield (name, replace(space, free=(*space.free, name), fixed=fixed),
-               np.array([[now + step if now + step <= 1 else now - step]]))
+               np.array([[now + step if now + step <= parameter.extent else now - step]]))
     if parts and space.parts == 1 and 'flexibility' in space.free:
         divided = space.divided(4)  # four parts can show a middle that is stiffer than both ends
-        even = np.array([BY_NAME[name].default for name in PART_NAMES[:3]]) / SCALE
+        even = np.array([BY_NAME[name].default / SCALE * BY_NAME[name].extent for name in PART_NAMES[:3]])
         yield PARTS, divided, even + MOVE * np.eye(len(even))
 
 

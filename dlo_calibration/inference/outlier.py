@@ -80,7 +80,7 @@ def spread_without(k: int, layout: ResidualLayout, point: Floats, residuals: Flo
 
     :param layout: of the residuals of all trials.
     :param point: (d,) the optimum of the others, where their residuals are `residuals`, (m - m_k,) [m].
-    :param jacobian: (m, d) derivative of the residuals of all trials [m per unit cube].
+    :param jacobian: (m, d) derivative of the residuals of all trials [m per unit].
     :param noise: standard deviation of one measured coordinate [m].
     """
     own = layout.rows[k]

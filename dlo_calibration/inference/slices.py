@@ -84,7 +84,7 @@ def simulate_slices(evaluator: Evaluator, best: Evaluation, std: Floats, examina
     Simulate slices around the found values, coarse ones first, until the time is up.
 
     :param best: the evaluation of the found values.
-    :param std: (d,) their standard deviations in the unit cube.
+    :param std: (d,) their standard deviations in units of a search.
     :param examination: of the found values; None if there was none.
     :param executor: its workers simulate, as in `Pool`.
     :param seconds: time limit [s].
@@ -133,9 +133,11 @@ class _Grid:
     def __init__(self, evaluate: BatchEvaluator, best: Evaluation, std: Floats) -> None:
         self._evaluate = evaluate
         self._best = best
-        reach = np.maximum(4.0 * std, NARROWEST / SCALE)
-        self._ends = [(max(0.0, value - size), min(1.0, value + size))
-                      for value, size in zip(best.point.tolist(), reach.tolist(), strict=True)]
+        upper = evaluate.evaluator.space.upper
+        self._scale = SCALE / upper  # of 100 in a unit
+        reach = np.maximum(4.0 * std, NARROWEST / self._scale)
+        self._ends = list(zip(np.maximum(0.0, best.point - reach).tolist(),
+                              np.minimum(upper, best.point + reach).tolist(), strict=True))
         self._evaluations: dict[tuple[float, ...], Evaluation] = {}
         self._names = evaluate.evaluator.space.free
 
@@ -159,7 +161,8 @@ class _Grid:
         """Return the line of one parameter; its values include the found one."""
         values = np.unique([*self._values(k, level), self._best.point[k]])
         scores, errors = _outcomes([self._at({k: float(value)}) for value in values])
-        return Line(self._names[k], frozen_array(values * SCALE), frozen_array(scores), frozen_array(errors))
+        return Line(self._names[k], frozen_array(values * self._scale[k]), frozen_array(scores),
+                    frozen_array(errors))
 
     def plane(self, pair: tuple[int, int], level: int) -> Plane:
         """Return the plane of two parameters."""
@@ -167,8 +170,8 @@ class _Grid:
         evaluations = [self._at({pair[0]: float(a), pair[1]: float(b)}) for a in first for b in second]
         scores, errors = (values.reshape(len(first), len(second)) for values in _outcomes(evaluations))
         return Plane((self._names[pair[0]], self._names[pair[1]]),
-                     frozen_array(np.stack([first, second]) * SCALE), frozen_array(scores),
-                     frozen_array(errors))
+                     frozen_array(np.stack([first, second]) * self._scale[list(pair), None]),
+                     frozen_array(scores), frozen_array(errors))
 
     def _values(self, k: int, level: int) -> Floats:
         low, high = self._ends[k]

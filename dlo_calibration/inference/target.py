@@ -20,7 +20,7 @@ SYMBOLS = {'EI': 'flexibility', 'EA': 'elasticity', 'mu': 'friction'}
 
 def read_targets(text: str) -> Mapping[str, float]:
     """
-    Return the wanted half width of the 90 % interval of each parameter, in the unit cube.
+    Return the wanted half width of the 90 % interval of each parameter, in units of a search.
 
     :param text: such as 'flexibility 2, friction 3' on the 0..100 scale, or 'EI 5 %' of the physical value.
     :raises InputError: if it is something else.
@@ -43,7 +43,7 @@ def read_targets(text: str) -> Mapping[str, float]:
             raise InputError(THING, f'{part.strip()}', f'a half width of {name} on the 0..100 scale, as its '
                              'physical value may be 0', 'leave the % out')
         scale = abs(math.log(parameter.at_hundred / parameter.at_zero)) if match[3] else SCALE
-        targets[name] = (math.log1p(number / 100) if match[3] else number) / scale
+        targets[name] = (math.log1p(number / 100) if match[3] else number) / scale * parameter.extent
     return targets
 
 

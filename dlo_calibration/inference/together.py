@@ -13,7 +13,7 @@ import numpy as np
 
 from dlo_calibration.inference.uncertainty import DEVIATIONS
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.model.parameters import BY_NAME, number
+from dlo_calibration.model.parameters import BY_NAME, extents, number
 
 CORRELATED = 0.943  # from here on, knowing one makes the other three times as certain
 SHARP = 0.1  # a parameter that is known to 10 % needs no other
@@ -56,11 +56,12 @@ def known_together(names: Sequence[str], covariance: Floats, deviations: Floats)
     """
     Return the pairs of parameters that are known only together, the best known one first.
 
-    :param covariance: (d, d) near the optimum, in the unit cube.
+    :param covariance: (d, d) near the optimum, in units of a search.
     :param deviations: (d,) standard deviations of each alone, which may be larger.
     """
     scales = np.array([0.0 if BY_NAME[name].linear else
                        np.log(BY_NAME[name].at_hundred / BY_NAME[name].at_zero) for name in names])
+    scales = scales / extents(names)
     physical = covariance * np.outer(scales, scales)  # of the logarithms
     std = np.sqrt(np.diag(physical))
     alone, pairs = _share(np.abs(scales) * deviations), []

@@ -46,6 +46,7 @@ from dlo_calibration.inference.uncertainty import (
 )
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import (
+    extents,
     knot_names,
     KNOTS,
     measured,
@@ -60,8 +61,8 @@ from dlo_calibration.observation.noise import NO_NOISE, with_other_noise
 
 ROUNDS = 8  # Gauss-Newton steps to the best values, at most
 WORTH_A_STEP = 0.02  # share of the cost that a step must promise to save
-WORTH_A_MOVE = 0.1  # share of the cost that one of the TRIED_VALUES must save
-TRIED_VALUES = (0.15, 0.4, 0.65, 0.9)  # of a parameter whose derivative may not point to its value
+WORTH_A_MOVE = 0.1  # share of the cost that one of the values TRIED must save
+TRIED = 0.15, 0.25  # the first value, and from one to the next, where a derivative may not point to the best
 MISFIT = 2.0  # times the noise level: larger residuals let the best values be sought all over the scales
 SCATTERED = 24  # points there
 STARTS = 8  # simulations of each trial from initial chains with other noise
@@ -76,7 +77,7 @@ class TrialInformation:
 
     :param trial: its name.
     :param names: of the d parameters.
-    :param before: (d,) standard deviations without the trial, in the unit cube.
+    :param before: (d,) standard deviations without the trial, in the box.
     :param after: (d,) standard deviations with the trial.
     :param verdicts: on each parameter, with the trial.
     :param failure: why they are unknown (nan); empty if they are known.
@@ -118,8 +119,10 @@ class TrialInformation:
         if not improved:
             return f'{self.trial} adds nothing new: repeat it only to average noise{self._so_far}'
         knots = [name for name in self.names if name in knot_names(KNOTS[-1])]
-        certain = [f'{name} (± {SCALE * before:.1f} -> ± {SCALE * after:.1f} of 100)'
-                   for name, before, after in zip(self.names, self.before, self.after, strict=True)
+        scale = SCALE / extents(self.names)
+        certain = [f'{name} (± {before:.1f} -> ± {after:.1f} of 100)'
+                   for name, before, after in zip(self.names, scale * self.before, scale * self.after,
+                                                  strict=True)
                    if name in improved and name not in knots]
         rest = [name for name in self.names if name not in improved and name not in knots]
         if knots:  # up to 18 of them
@@ -146,14 +149,14 @@ class TrialInformation:
         """Standard deviations (0..100) and verdicts, under the keys of a status; empty if unknown."""
         if self.failure:
             return {}
-        return {f'{key}_{name}': float(std) * SCALE for key, column in (
+        return {f'{key}_{name}': float(std) for key, column in (
             ('std_before', self.before), ('std_after', self.after))
-            for name, std in zip(self.names, column, strict=True)} | {
+            for name, std in zip(self.names, column / extents(self.names) * SCALE, strict=True)} | {
                 f'verdict_{name}': verdict for name, verdict in zip(self.names, self.verdicts, strict=False)}
 
 
 def std_of_each_alone(trials: Sequence[Trial], examination: Examination) -> Floats:
-    """Return (T, d): the standard deviations in the unit cube that each calibrated trial would give alone."""
+    """Return (T, d): the standard deviations, in units of a search, that each trial would give alone."""
     scale, prior = examination.uncertainty.scale, prior_information(examination.jacobian.shape[1])
     return np.array([standard_deviations(information(examination.jacobian[rows], scale) + prior)
                      for rows in ResidualLayout.compared(trials).rows])
@@ -224,9 +227,10 @@ class Appraisal:
     @classmethod
     def before(cls, names: tuple[str, ...], point: Floats) -> Appraisal:
         """Return the appraisal before any simulation, at a (d,) point to begin from."""
-        ones = np.ones(len(names))
+        ones, ends = np.ones(len(names)), extents(names)
         return cls(names, point, Uncertainty(
-            UNKNOWN_STD * ones, 0 * ones, ones, ones == 0, ones == 0, UNKNOWN_STD**2 * np.eye(len(names))))
+            UNKNOWN_STD * ones, 0 * ones, ends, ones == 0, ones == 0, UNKNOWN_STD**2 * np.eye(len(names)),
+            ends=ends))
 
 
 def without_repeated_goals(trial: Trial) -> Trial:
@@ -334,7 +338,7 @@ class Appraiser:
             best = _Minimum(fit.residuals, point, now, uncertainty)
             weighted = fit.weighted(loss.roots(fit.residuals) / uncertainty.scale)
             step = weighted.step(prior_information(len(point)))
-            there = np.clip(point + np.clip(step, -WIDEST, WIDEST), 0.0, 1.0)
+            there = np.clip(point + np.clip(step, -WIDEST, WIDEST), 0.0, self.space.upper)
             saved = loss.cost(fit.residuals) - loss.cost(fit.predicted(there - point))
             if saved < WORTH_A_STEP * loss.cost(fit.residuals):
                 break
@@ -354,7 +358,8 @@ class Appraiser:
         for k, name in enumerate(self.space.free):
             if name not in self.guessed or not shown[k] or best.uncertainty.verdicts[k] != NOT_IDENTIFIABLE:
                 continue
-            points = [np.where(np.arange(len(start)) == k, value, start) for value in TRIED_VALUES]
+            values = np.arange(TRIED[0], self.space.upper[k], TRIED[1])
+            points = [np.where(np.arange(len(start)) == k, value, start) for value in values]
             costs = [best.loss.cost(self._residuals(trials, point)) for point in points]
             if min(costs) < (1 - WORTH_A_MOVE) * cost:
                 start, cost = points[int(np.argmin(costs))], min(costs)
@@ -404,7 +409,7 @@ class Appraiser:
         if isinstance(jacobian, SimulationError):
             raise jacobian
         rows = np.repeat(seen_points(trial).ravel(), 3)
-        return TrialModel(Linearisation(point, here, jacobian[rows]),
+        return TrialModel(Linearisation(point, here, jacobian[rows], self.space.upper),
                           np.zeros((STARTS, len(here))), np.zeros(len(here)))
 
     def _completed(self, model: TrialModel, trial: Trial) -> TrialModel:
@@ -429,5 +434,6 @@ def _joint_model(models: Sequence[TrialModel], trials: Sequence[Trial], point: F
            ) -> tuple[Linearisation, ResidualLayout]:
     """Return the linear model of all trials at a (d,) point, and the layout of its residuals."""
     fits = [model.fit for model in models]
-    return Linearisation(point, np.concatenate([fit.predicted(point - fit.point) for fit in fits]),
-                         np.concatenate([fit.jacobian for fit in fits])), ResidualLayout.of(trials)
+    residuals = np.concatenate([fit.predicted(point - fit.point) for fit in fits])
+    jacobian = np.concatenate([fit.jacobian for fit in fits])
+    return Linearisation(point, residuals, jacobian, fits[0].upper), ResidualLayout.of(trials)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Uncertainty: the covariance and the intervals of the calibrated parameters, in the unit cube.
+Uncertainty: the covariance and the intervals of the calibrated parameters, in units of a search.
 
 If the search ended in a regular minimum, the covariance follows from the Jacobian of the residuals there.
 The textbook's formula alone is several times too small for real DLOs.  Therefore it takes six more effects
@@ -29,13 +29,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_calibration.evaluation.evaluation import Evaluation
-from dlo_calibration.evaluation.linearisation import Linearisation, Rows, TINY
+from dlo_calibration.evaluation.linearisation import Ends, Linearisation, Rows, TINY
 from dlo_calibration.evaluation.residuals import Huber, ResidualLayout
 from dlo_calibration.model.chain import Floats, frozen_array
 
-UNKNOWN_STD = 1 / np.sqrt(12)  # of the uniform distribution on 0..1, which is the prior
+UNKNOWN_STD = 1 / np.sqrt(12)  # of the uniform distribution over one unit, which is the prior
 HARDLY = 0.95  # of UNKNOWN_STD; trials that leave more inform about nothing
-# Widths of a 90 % interval, in the unit cube.  At the ends of the first, simulated points of the reference
+# Widths of a 90 % interval, in units of a search.  At the ends of the first, simulated points of reference
 # objects move by 4 % of the length (bending stiffness) and 2 % (friction), on average over nine actions; at
 # the ends of the second by 7 and 4 %, which is most of the 10 and 6 % that a value from far away costs.
 IDENTIFIABLE_WIDTH, WEAK_WIDTH = 0.2, 0.4
@@ -48,13 +48,15 @@ INVOLVED = 0.3  # a parameter belongs to a combination if its share of the unit 
 IDENTIFIABLE, WEAK, NOT_IDENTIFIABLE = 'identifiable', 'weak', 'not identifiable'
 
 
-def verdict(lower: float, upper: float) -> str:
+def verdict(lower: float, upper: float, end: float = 1.0) -> str:
     """
-    Return the verdict on a parameter, from its 90 % interval in the unit cube: the narrower, the better.
+    Return the verdict on a parameter, from its 90 % interval in the box: the narrower, the better.
 
     An interval that reaches an end of the scale is a bound on one side: its parameter is weak at best.
+
+    :param end: the upper end of the scale.
     """
-    width, cut = upper - lower, lower <= 0 or upper >= 1
+    width, cut = upper - lower, lower <= 0 or upper >= end
     if width > WEAK_WIDTH:
         return NOT_IDENTIFIABLE
     return WEAK if cut or width > IDENTIFIABLE_WIDTH else IDENTIFIABLE
@@ -63,7 +65,7 @@ def verdict(lower: float, upper: float) -> str:
 @dataclass(frozen=True)
 class Uncertainty:
     """
-    How certain d parameters are, in the unit cube.
+    How certain d parameters are, in units of a search.
 
     :param std: (d,) standard deviation.
     :param lower: (d,) lower end of the 90 % interval; `upper` (d,) its upper end.
@@ -73,6 +75,7 @@ class Uncertainty:
     :param local: (d, d) covariance before intervals were widened to where the linear model no longer holds.
     :param residual: standard deviation of one coordinate's residual [m]; nan if it was not estimated.
     :param scale: the same, enlarged because neighbouring residuals are correlated [m].
+    :param ends: (d,) upper ends of the box, or one for all; the lower ones are 0.
     """
 
     std: Floats
@@ -84,11 +87,13 @@ class Uncertainty:
     residual: float = float('nan')
     scale: float = float('nan')
     local: Floats | None = None
+    ends: Ends = 1.0
 
     @property
     def verdicts(self) -> tuple[str, ...]:
         """The verdict on each parameter."""
-        return tuple(map(verdict, self.lower.tolist(), self.upper.tolist()))
+        return tuple(map(verdict, self.lower.tolist(), self.upper.tolist(),
+                         np.broadcast_to(self.ends, self.upper.shape).tolist()))
 
     @property
     def spread(self) -> Floats:
@@ -105,7 +110,7 @@ class Uncertainty:
         return replace(
             self, excited=excited, std=frozen_array(np.where(excited, self.std, UNKNOWN_STD)),
             lower=frozen_array(np.where(excited, self.lower, 0.0)),
-            upper=frozen_array(np.where(excited, self.upper, 1.0)))
+            upper=frozen_array(np.where(excited, self.upper, self.ends)))
 
     def within(self, lower: Floats, upper: Floats) -> Uncertainty:
         """Return the uncertainty with wider intervals, (d,) each, and standard deviations to match."""
@@ -134,11 +139,12 @@ class Uncertainty:
             shrink = np.minimum(1.0, std / np.sqrt(np.diag(covariance)))
             covariance = frozen_array(covariance * np.outer(shrink, shrink))
         lower = np.maximum(there - wider * (point - self.lower), 0.0)
-        upper = np.minimum(there + wider * (self.upper - point), 1.0)
+        upper = np.minimum(there + wider * (self.upper - point), self.ends)
         return replace(
-            self, std=frozen_array(std), covariance=covariance, at_bound=self.excited & at_end(there),
+            self, std=frozen_array(std), covariance=covariance,
+            at_bound=self.excited & at_end(there, self.ends),
             lower=frozen_array(np.where(self.lower > 0, lower, 0.0)),
-            upper=frozen_array(np.where(self.upper < 1, upper, 1.0)))
+            upper=frozen_array(np.where(self.upper < self.ends, upper, self.ends)))
 
     @property
     def correlations(self) -> Floats | None:
@@ -168,7 +174,7 @@ def good_count(evaluations: int) -> int:
     return max(8, round(0.05 * evaluations))
 
 
-def spread_of_best(evaluations: Sequence[Evaluation], best: Floats) -> Uncertainty:
+def spread_of_best(evaluations: Sequence[Evaluation], best: Floats, ends: Ends = 1.0) -> Uncertainty:
     """
     Return the spread of the parameters of the best evaluations.
 
@@ -176,21 +182,24 @@ def spread_of_best(evaluations: Sequence[Evaluation], best: Floats) -> Uncertain
     `std` is the root mean square distance of the best 5 %, but at least 8, from the (d,) point `best`;
     `lower` and `upper` are their extremes.  With too few evaluations, no parameter is identifiable.  The
     spread depends on the search as much as on the trials.
+
+    :param ends: (d,) upper ends of the box, or one for all.
     """
     good = sorted((e for e in evaluations if np.isfinite(e.score)), key=lambda e: e.score)
     count = good_count(len(evaluations))
     everywhere = np.ones(len(best), dtype=np.bool_)
     if len(good) < 2 * count:
         unknown = np.ones_like(best)
-        return Uncertainty(unknown * UNKNOWN_STD, unknown * 0, unknown, everywhere, ~everywhere)
+        return Uncertainty(unknown * UNKNOWN_STD, unknown * 0, unknown * ends, everywhere, ~everywhere,
+                           ends=ends)
     points = np.stack([e.point for e in good[:count]])
     std = np.minimum(np.sqrt(np.mean((points - best) ** 2, axis=0)), UNKNOWN_STD)
     return Uncertainty(std, np.minimum(points.min(axis=0), best), np.maximum(points.max(axis=0), best),
-                       everywhere, ~everywhere)
+                       everywhere, ~everywhere, ends=ends)
 
 
 def prior_information(dimension: int) -> Floats:
-    """Return the (d, d) information of the prior: a uniform distribution of d parameters on their scales."""
+    """Return the (d, d) information of the prior: a uniform distribution of d parameters over one unit."""
     return np.asarray(np.eye(dimension) / UNKNOWN_STD**2)
 
 
@@ -262,17 +271,17 @@ def at_minimum(fit: Linearisation, layout: ResidualLayout, *, noise: float = flo
     covariance = covariance * np.outer(shrink, shrink)
     std = np.where(excited, np.sqrt(np.diag(covariance)), UNKNOWN_STD)
     lower = np.where(excited, np.maximum(point - DEVIATIONS * std, 0.0), 0.0)
-    upper = np.where(excited, np.minimum(point + DEVIATIONS * std, 1.0), 1.0)
+    upper = np.where(excited, np.minimum(point + DEVIATIONS * std, fit.upper), fit.upper)
     uncertainty = Uncertainty(frozen_array(std), frozen_array(lower), frozen_array(upper), excited,
-                              excited & at_end(point), frozen_array(covariance), residual, scale,
-                              frozen_array(covariance))
-    return uncertainty.within(np.clip(np.minimum(lower, point + without.min(axis=0)), 0.0, 1.0),
-                              np.clip(np.maximum(upper, point + without.max(axis=0)), 0.0, 1.0))
+                              excited & at_end(point, fit.upper), frozen_array(covariance), residual, scale,
+                              frozen_array(covariance), fit.upper)
+    return uncertainty.within(np.clip(np.minimum(lower, point + without.min(axis=0)), 0.0, fit.upper),
+                              np.clip(np.maximum(upper, point + without.max(axis=0)), 0.0, fit.upper))
 
 
-def at_end(point: Floats) -> NDArray[np.bool_]:
-    """Return (d,) True where a (d,) point is at an end of the scale."""
-    return np.asarray((point < 0.002) | (point > 0.998))
+def at_end(point: Floats, ends: Ends) -> NDArray[np.bool_]:
+    """Return (d,) True where a (d,) point is at an end of the scale, 0 or `ends`."""
+    return np.asarray((point < 0.002) | (point > ends - 0.002))
 
 
 def similar_trials(fit: Linearisation, layout: ResidualLayout) -> list[list[int]]:
@@ -412,7 +421,7 @@ def optimum_shift(fit: Linearisation, finer: Floats) -> Floats:
     """
     Return (d,): how far the optimum moves if a finer simulation gives the residuals `finer`, (m,) [m].
 
-    This is a Gauss-Newton step on the difference; no parameter moves further than its whole scale.
+    This is a Gauss-Newton step on the difference; no parameter moves further than a unit.
     """
     return np.clip(replace(fit, residuals=finer - fit.residuals).step(fit.ridge), -1.0, 1.0)
 

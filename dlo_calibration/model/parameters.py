@@ -5,9 +5,10 @@
 Parameters: their values on the paper's scale from 0 to 100, and their physical quantities.
 
 The package computes in SI units; the scale from 0 to 100 exists here and at the
-edges (messages, files, tables).  A new parameter is one more entry of PARAMETERS;
-an engine reads its physical value by name.  The formulas at the end define the parameters of bending for a
-piece of DLO: the rest shape, and the moment that bends it.
+edges (messages, files, tables).  A search has units of its own, see `Parameter.stride`.
+A new parameter is one more entry of PARAMETERS; an engine reads its physical value by
+name.  The formulas at the end define the parameters of bending for a piece of DLO: the
+rest shape, and the moment that bends it.
 """
 
 from __future__ import annotations
@@ -91,6 +92,9 @@ class Parameter:
         there: 1 for a ratio, or 0, which a logarithmic scale does not contain.
     :param per_weight: True if motion under gravity depends only on the ratio of this
         parameter to the DLO's weight; this ratio is reported where the mass is unknown.
+    :param stride: ratio of two physical values (their difference on a linear scale) that are one unit of a
+        search apart; None: that of both ends of the scale. Steps and tolerances of a search, and what counts
+        as known, are shares of this unit, so that they stay the same where a scale becomes wider.
     """
 
     name: str
@@ -103,6 +107,19 @@ class Parameter:
     per_weight: bool = False
     linear: bool = False
     neutral: float | None = None
+    stride: float | None = None
+
+    @property
+    def extent(self) -> float:
+        """The length of the scale in units of a search."""
+        if self.stride is None:
+            return 1.0
+        return (self.at_hundred - self.at_zero) / self.stride if self.linear else \
+            abs(math.log(self.at_hundred / self.at_zero)) / math.log(self.stride)
+
+    def coordinate(self, physical: float) -> float:
+        """Return the coordinate of a physical value in the box of a search, or beyond it."""
+        return self.value(physical) / SCALE * self.extent
 
     def physical(self, value: float) -> float:
         """Return the physical value, in `unit`, of `value` on the 0..100 scale."""
@@ -152,8 +169,8 @@ def knot_names(knots: int) -> tuple[str, ...]:
 
 #: The paper's four, then those that are fixed by default.
 PARAMETERS: tuple[Parameter, ...] = (
-    Parameter('flexibility', 'bending stiffness EI', 'N m^2', 10**-1.0, 10**-5.5, 50.0,
-              'how easily the DLO bends', per_weight=True),
+    Parameter('flexibility', 'bending stiffness EI', 'N m^2', 10**1.0, 10**-5.5, 65.4,
+              'how easily the DLO bends', per_weight=True, stride=10**4.5),
     Parameter('elasticity', 'stretching stiffness EA', 'N', 1e4, 1e0, 25.0,
               'how easily the DLO stretches', per_weight=True),
     Parameter('friction', 'Coulomb friction coefficient', '1', 10**-2.0, 10**0.3, 70.0,
@@ -197,6 +214,11 @@ PARAMETERS: tuple[Parameter, ...] = (
 )
 
 
+def extents(names: Sequence[str]) -> Floats:
+    """Return the (d,) lengths of the scales of parameters in units of a search."""
+    return np.array([BY_NAME[name].extent for name in names])
+
+
 def owner(name: str) -> tuple[str, int]:
     """Return the parameter of a name, and the number of the session whose own value it is; 0: of all."""
     match = _OWN.fullmatch(name)
@@ -229,6 +251,13 @@ PART_NAMES = tuple(part_name(part) for part in range(2, MOST_PARTS + 1))
 HANDS = ('hand_delay', 'hand_shift_x', 'hand_shift_y', 'hand_shift_z')
 REST_SHAPE = ('clamp_twist', *knot_names(KNOTS[-1]))
 PAPER_PARAMETERS = ('flexibility', 'elasticity', 'friction', 'self_collision')
+SCALES = 2  # version of the scales in files; in the first, `flexibility` began at 0.1 N m^2
+_FIRST_FLEXIBILITY = replace(BY_NAME['flexibility'], at_zero=0.1)
+
+
+def from_first_scale(value: float) -> float:
+    """Return a `flexibility` of version 1 of the scales on today's scale; both are 0 to 100."""
+    return BY_NAME['flexibility'].value(_FIRST_FLEXIBILITY.physical(value))
 
 
 def _absent_knots(knots: int) -> tuple[str, ...]:
@@ -244,6 +273,8 @@ class ParameterSpace:
     The DLO has k parts of equal length if `stiffness_k` is the highest such name that is
     free or fixed; without any, it has one part. Likewise, its rest shape has the number
     of knots of `KNOTS` that the highest such name needs.
+
+    A search moves in a box, from 0 to the extent of the scale of each free parameter.
 
     :param free: names of the parameters to find, in order.
     :param fixed: values of others on the 0..100 scale; the rest keep their defaults.
@@ -274,6 +305,11 @@ class ParameterSpace:
     def dimension(self) -> int:
         """Number of parameters to find."""
         return len(self.free)
+
+    @property
+    def upper(self) -> Floats:
+        """The (d,) upper ends of the box of a search; the lower ones are 0."""
+        return extents(self.free)
 
     @property
     def parts(self) -> int:
@@ -355,15 +391,16 @@ class ParameterSpace:
         return own == session if own else own_name(name, session) not in self.free or session == 1
 
     def values(self, point: Sequence[float] | Floats) -> dict[str, float]:
-        """Return the free parameters on the 0..100 scale at a (d,) point of the unit cube."""
-        return {name: float(u) * SCALE for name, u in zip(self.free, point, strict=True)}
+        """Return the free parameters on the 0..100 scale at a (d,) point of the box."""
+        return {name: float(u) / BY_NAME[name].extent * SCALE
+                for name, u in zip(self.free, point, strict=True)}
 
     def point(self, values: Mapping[str, float]) -> NDArray[np.float64]:
-        """Return the (d,) point of the unit cube at free parameters on the 0..100 scale."""
-        return np.array([values[name] / SCALE for name in self.free])
+        """Return the (d,) point of the box at free parameters on the 0..100 scale."""
+        return np.array([values[name] / SCALE * BY_NAME[name].extent for name in self.free])
 
     def default_point(self) -> NDArray[np.float64]:
-        """Return the (d,) point of the unit cube at the fixed values and, for the others, the defaults."""
+        """Return the (d,) point of the box at the fixed values and, for the others, the defaults."""
         return self.point({name: self.fixed.get(name, BY_NAME[name].default) for name in self.free})
 
     def physical(self, values: Mapping[str, float], length: float) -> dict[str, float]:

@@ -297,9 +297,9 @@ def prior_estimates(trials: Sequence[Trial], space: ParameterSpace,
 
 
 def start_point(trials: Sequence[Trial], space: ParameterSpace, table_height: float | None) -> Floats:
-    """Return the `prior_estimates` as a (d,) point of the unit cube, nan where there is none."""
+    """Return the `prior_estimates` as a (d,) point of the box, nan where there is none."""
     estimates = prior_estimates(trials, space, table_height)
-    return frozen_array([estimate.value / SCALE for estimate in estimates.values()])
+    return frozen_array(space.point({name: estimate.value for name, estimate in estimates.items()}))
 
 
 def _on_scale(name: str, value: float, lowest: float, highest: float) -> PriorEstimate:

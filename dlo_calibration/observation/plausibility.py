@@ -21,14 +21,15 @@ import numpy as np
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.action import Hand
 from dlo_calibration.model.chain import Chain, Floats
-from dlo_calibration.model.parameters import measured, number
+from dlo_calibration.model.parameters import GRAVITY, measured, number
 from dlo_calibration.model.trial import Goal, shown_goals, Trial
 from dlo_calibration.observation.noise import noise, noise_of
 from dlo_calibration.observation.table import HANGING, lowest_level, RESTING_BAND
 
-SHORTEST, LONGEST = 0.02, 15.0  # m; hands manipulate no DLO beyond; half a metre in inches is 20
+SHORTEST, LONGEST = 0.009, 16.5  # m; 1 cm to 15 m, measured with noise; half a metre in inches is 20
 UNITS = {'millimetres': 1e-3, 'centimetres': 1e-2, 'inches': 0.0254}
 BELOW = 0.01  # m; a table may be measured with such an error, and trackers see the table through a thin DLO
+LONGEST_STEP = 0.025  # of the time in which a DLO swings; beyond, released ones end elsewhere
 SIGMAS = 5.0  # standard deviations that noise never exceeds
 STEEPEST = math.radians(15.0)  # of the plane in which a DLO lies; table poses are more exact
 BESIDE = math.radians(60.0)  # of a centre of mass from straight below the hands that hold a DLO
@@ -53,16 +54,24 @@ def implausible_trials(trials: Sequence[Trial], table_height: float | None,
             *[f'{more} more trial(s) are implausible'] * (more > 0))
 
 
-def observation_warnings(trials: Sequence[Trial], table_height: float | None, mass: float = 0.0
-                         ) -> tuple[str, ...]:
+def observation_warnings(trials: Sequence[Trial], table_height: float | None, mass: float = 0.0,
+                         time_step: float = 0.0) -> tuple[str, ...]:
     """
-    Return warnings about how trials were observed: repeated ones, their noise, and the height of the table.
+    Return warnings about how trials were observed: repeated ones, noise, a short DLO, the table's height.
 
     :param table_height: [m]; None: there is no table.
     :param mass: of the whole DLO [kg]; 0: unknown.
+    :param time_step: of the simulation [s].
     """
     warnings = list(repeated_trials(trials))
     length = float(np.mean([trial.initial.length for trial in trials]))
+    swing = math.sqrt(length / GRAVITY)
+    if time_step > LONGEST_STEP * swing:
+        warnings.append(str(InputError(
+            'the simulation',
+            f'a time step of {number(1e3 * time_step)} ms for a DLO of {measured(length, "m")}',
+            f'at most {number(float(f"{1e3 * LONGEST_STEP * swing:.2g}"))} ms, as short DLOs move fast',
+            f'set time_step to {number(float(f"{0.4 * LONGEST_STEP * swing:.1g}"))}')))
     sigma = float(np.nan_to_num(noise(trials)))
     if sigma > NOISY * length:
         warnings.append(str(InputError(

@@ -10,7 +10,6 @@ from typing import Any, Sequence
 
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.model.parameters import SCALE
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.workspace.live_information import fingerprints, LiveInformation
 
@@ -59,10 +58,10 @@ class Information:
                 self._appraised = key
         news = False
         for information in self._appraiser.waiting_information():
+            std = information.values
             values = None if information.failure else {
-                name: {'before': float(before) * SCALE, 'after': float(after) * SCALE}
-                for name, before, after in zip(
-                    information.names, information.before, information.after, strict=True)}
+                name: {'before': std[f'std_before_{name}'], 'after': std[f'std_after_{name}']}
+                for name in information.names}
             self._entries[information.trial] = {'parameters': values, 'sentence': information.words}
             news = True
         return news

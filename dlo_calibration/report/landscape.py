@@ -115,7 +115,8 @@ def _region(result: CalibrationResult, plane: Plane) -> Floats | None:
     angles = np.linspace(0, 2 * np.pi, 120)
     circle = np.stack([np.cos(angles), np.sin(angles)])
     border = vectors @ (np.sqrt(values)[:, None] * radius * circle)
-    return np.asarray((result.best.point[chosen][:, None] + border) * SCALE)
+    scale = SCALE / result.space.upper[chosen][:, None]
+    return np.asarray((result.best.point[chosen][:, None] + border) * scale)
 
 
 def _mark(axes: Axes, x: float, y: float) -> None:

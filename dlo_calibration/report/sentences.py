@@ -28,7 +28,6 @@ from dlo_calibration.model.parameters import (
     number,
     ParameterSpace,
     PER_WEIGHT,
-    SCALE,
 )
 from dlo_calibration.model.score import MEAN_DISTANCE, SIMILAR, VERY_SIMILAR
 
@@ -97,10 +96,10 @@ def _advice(result: CalibrationResult) -> list[str]:
         return []
     partners = [name for pair in result.together for name in (pair.first, pair.second)
                 if advice.parameter in (pair.first, pair.second) and name != advice.parameter]
+    deviation, expected = (number(advice.of_hundred[key]) for key in ('std', 'expected_std'))
     aim = f'tell {advice.parameter} from {partners[0]}' if partners else f'know {advice.parameter} better'
     return [f'To {aim}, {advice.words} (action {advice.action}). On the scale from '
-            f'0 to 100, that should bring its standard deviation from {number(advice.std * SCALE)} to '
-            f'{number(advice.expected_std * SCALE)}.']
+            f'0 to 100, that should bring its standard deviation from {deviation} to {expected}.']
 
 
 def _fit(result: CalibrationResult) -> list[str]:

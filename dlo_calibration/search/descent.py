@@ -11,7 +11,7 @@ from typing import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_calibration.evaluation.linearisation import broyden, Linearisation, TINY
+from dlo_calibration.evaluation.linearisation import broyden, Ends, Linearisation, TINY
 from dlo_calibration.evaluation.residuals import Huber
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.search.protocol import Observation
@@ -69,28 +69,30 @@ def _solved(matrix: Floats, right: Floats, least: Floats, most: Floats, x: Float
 @dataclass
 class Descent:
     """
-    State of one descent in the unit cube of d parameters.
+    State of one descent in the box of d parameters.
 
     :param point: (d,) current point.
     :param residuals: (m,) [m] at that point.
     :param loss: robust loss; its threshold never grows during the descent.
-    :param jacobian: (m, d) [m per unit cube], measured at `origin` and updated by later steps.
+    :param jacobian: (m, d) [m per unit], measured at `origin` and updated by later steps.
     :param radius: largest step in each parameter.
     :param roughness: [m] root mean square of the residuals' change that the model missed in the last step.
     :param origin: (d,) where the Jacobian was measured by finite differences; None: it was not.
     :param moves: number of moves since then.
     :param ended: why the descent ended, in words; empty while it goes on.
+    :param upper: (d,) upper ends of the box, or one for all; the lower ones are 0.
     """
 
     point: Floats
     residuals: Floats
     loss: Huber
     jacobian: Floats
-    radius: float = 0.25  # a quarter of the range
+    radius: float = 0.25
     roughness: float = 0.0
     origin: Floats | None = None
     moves: int = 0
     ended: str = ''
+    upper: Ends = 1.0
 
     @property
     def cost(self) -> float:
@@ -100,7 +102,7 @@ class Descent:
     @property
     def model(self) -> Linearisation:
         """Linear model of the residuals around the current point."""
-        return Linearisation(self.point, self.residuals, self.jacobian)
+        return Linearisation(self.point, self.residuals, self.jacobian, self.upper)
 
     @property
     def jacobian_is_fresh(self) -> bool:
@@ -120,16 +122,16 @@ class Descent:
             self.loss = loss
 
     def visible(self) -> NDArray[np.bool_]:
-        """Return (d,) True where the whole range of a parameter changes the residuals visibly."""
+        """Return (d,) True where a unit of a parameter changes the residuals visibly."""
         size = np.linalg.norm(self.jacobian, axis=0)
         return np.asarray(size > max(self.loss.threshold, 1e-9 * float(size.max(initial=0.0))))
 
     def step(self, radius: float) -> Floats:
-        """Return the (d,) step that minimises the model within the unit cube and the radius."""
+        """Return the (d,) step that minimises the model within the box and the radius."""
         free = self.visible()
         step = np.zeros(len(self.point))
         least = np.maximum(-self.point, -radius)[free]
-        most = np.minimum(1 - self.point, radius)[free]
+        most = np.minimum(self.upper - self.point, radius)[free]
         movable = most - least > 1e-12
         columns = np.flatnonzero(free)[movable]
         if not len(columns):
@@ -145,7 +147,7 @@ class Descent:
         return step
 
     def axis_steps(self, radius: float) -> list[Floats]:
-        """Return the (d,) step along each principal axis of the model, within unit cube and radius."""
+        """Return the (d,) step along each principal axis of the model, within box and radius."""
         columns = np.flatnonzero(self.visible())
         model = self.model.columns(columns).weighted(self.loss.roots(self.residuals))
         curvatures, axes = np.linalg.eigh(model.information)
@@ -154,7 +156,7 @@ class Descent:
             step = np.zeros(len(self.point))
             step[columns] = -axis * (axis @ model.gradient) / max(float(curvature), TINY)
             share = min(1.0, radius / max(float(np.abs(step).max()), TINY))
-            steps.append(np.clip(self.point + share * step, 0.0, 1.0) - self.point)
+            steps.append(np.clip(self.point + share * step, 0.0, self.upper) - self.point)
         return steps
 
     def predicted(self, step: Floats) -> float:

@@ -18,7 +18,7 @@ from dlo_calibration.search.descent import Descent, NEAR
 from dlo_calibration.search.protocol import Batches, Hints, Observation, Search
 from dlo_calibration.search.sobol import Sobol
 
-# Steps and distances are in the unit cube.
+# Steps and distances are in units of a search.
 FIRST_STEP = 0.015  # of a finite difference; larger steps mislead beside a narrow valley
 SHORTER = 1 / 4  # radius of the second step that is tried, relative to the first
 DONE_STEP = 1e-3  # converged where the next step changes every parameter by no more than this
@@ -39,7 +39,7 @@ def costs_less(residuals: Floats, others: Floats) -> bool:
 
 class LeastSquares(Search):
     """
-    Minimise the robust sum of squared residuals within the unit cube.
+    Minimise the robust sum of squared residuals within the box.
 
     The start points fill the cube.  A descent from the best of them takes Gauss-Newton steps within a box
     (Nocedal and Wright, Numerical Optimization, 2nd ed., 10.3).  Finite differences give the Jacobian, and
@@ -55,7 +55,7 @@ class LeastSquares(Search):
 
     def __init__(self, dimension: int, seed: int, hints: Hints | None = None) -> None:
         super().__init__(dimension, seed, hints)
-        # [m] root mean square change of the residuals over the whole range of each parameter: the smallest
+        # [m] root mean square change of the residuals over a unit of each parameter: the smallest
         # one measured, as contacts that come and go make columns too large, never too small.
         self._least_effect = np.full(dimension, np.inf)
         self._descents: list[Descent] = []
@@ -69,7 +69,8 @@ class LeastSquares(Search):
         near = [(float(np.abs(descent.point - lowest.point)[descent.visible()].max(initial=0.0)),
                  descent.jacobian) for descent in self._descents if descent.jacobian.any()]
         distance, jacobian = min(near, key=lambda pair: pair[0], default=(np.inf, np.zeros(0)))
-        return Linearisation(lowest.point, lowest.residuals, jacobian) if distance <= NEAR else None
+        return None if distance > NEAR else Linearisation(
+            lowest.point, lowest.residuals, jacobian, self._upper)
 
     def _improves(self, observation: Observation) -> bool:
         """Tell whether an observation costs less than the lowest so far."""
@@ -159,14 +160,14 @@ class LeastSquares(Search):
                 break
             least = self._least_effect[columns].max(initial=0.0) / self._least_effect
             reach = np.clip(STEP * np.sqrt(least), STEP, 5 * STEP)
-            sides = Differences.central(here.point, columns, reach)
+            sides = Differences.central(here.point, columns, reach, self._upper)
             beside = yield sides.points
             wide = sides.jacobian(here.jacobian, [observation.residuals for observation in beside])
-            there = Descent(here.point, here.residuals, here.loss, wide, NEAR, origin=here.point)
+            there = replace(here, jacobian=wide, radius=NEAR, origin=here.point)
             steps = [there.step(radius) for radius in (SCAN_RADIUS, NEAR, NEAR / 3)]
             steps += [step for step in there.axis_steps(SCAN_RADIUS)
                       if there.predicted(step) < (1 - STALLED) * there.cost]
-            tried = yield np.clip([here.point + step for step in steps], 0.0, 1.0)
+            tried = yield np.clip([here.point + step for step in steps], 0.0, self._upper)
             best = min((*beside, *tried), key=lambda observation: here.loss.cost(observation.residuals))
             if here.loss.cost(best.residuals) >= (1 - 2e-3) * here.cost:
                 break  # a gain of less than 0.2 % is not worth another iteration
@@ -177,8 +178,9 @@ class LeastSquares(Search):
     def _begin(self, start: Observation) -> Descent:
         assert start.residuals is not None
         begun = Descent(start.point, start.residuals, Huber.of(start.residuals),
-                        np.zeros((len(start.residuals), self._dimension)))
-        if self._hints.jacobian is not None and np.array_equal(start.point, np.clip(self._hints.start, 0, 1)):
+                        np.zeros((len(start.residuals), self._dimension)), upper=self._upper)
+        if self._hints.jacobian is not None and np.array_equal(
+                start.point, np.clip(self._hints.start, 0, self._upper)):
             begun.jacobian, begun.moves = self._hints.jacobian, 1
             begun.origin = np.full(self._dimension, np.inf)  # not fresh, as it is not quite that of here
             self._update_effects(begun)
@@ -194,7 +196,7 @@ class LeastSquares(Search):
         if not len(free):
             return None
         weakest = free[np.argmin(self._least_effect[free])]
-        values = np.array([value for value in (0.1, 0.3, 0.5, 0.7, 0.9)
+        values = np.array([value for value in np.arange(0.1, self._upper[weakest], 0.2)
                            if abs(value - here.point[weakest]) > SCAN_RADIUS])
         points = np.tile(here.point, (len(values), 1))
         points[:, weakest] = values
@@ -203,7 +205,7 @@ class LeastSquares(Search):
         for observation in observations:
             if observation.residuals is not None:
                 there = Descent(observation.point, observation.residuals, here.loss, here.jacobian, NEAR,
-                                origin=here.origin)
+                                origin=here.origin, upper=self._upper)
                 predicted = min(there.predicted(there.step(SCAN_RADIUS)), there.cost)
                 if predicted < lowest:
                     lowest, best = predicted, there
@@ -214,16 +216,17 @@ class LeastSquares(Search):
         # Two per parameter and at least eight; a Sobol sequence is balanced only for powers of two.
         count = 2 ** int(np.ceil(np.log2(max(8, 2 * self._dimension))))
         sobol = Sobol(self._dimension, self._seed)
-        hint = np.clip(self._hints.start, 0, 1)
+        hint = np.clip(self._hints.start, 0, self._upper)
         if self._hints.refines:
             observations = yield hint[None, :]
             if observations[0].residuals is not None:
                 return list(observations)
         while True:
-            points = sobol.random(count)
+            points = self._hints.spread(sobol.random(count))
             # Half of them have the prior estimate: a good one saves a lot, a wrong one spoils only half.
             points[::2] = np.where(np.isnan(hint), points[::2], hint)
-            points[:, ~self._hints.excited] = np.where(np.isnan(hint), 0.5, hint)[~self._hints.excited]
+            idle = ~self._hints.excited
+            points[:, idle] = np.where(np.isnan(hint), self._hints.spread(0.5), hint)[idle]
             order = np.unique(points, axis=0, return_index=True)[1]
             observations = yield points[np.sort(order)]
             starts = [start for start in observations if start.residuals is not None]
@@ -309,7 +312,7 @@ class LeastSquares(Search):
         shorter = here.step(here.radius * SHORTER)
         if np.abs(steps[0] - shorter).max() > 0.1 * np.abs(steps[0]).max():
             steps.append(shorter)
-        observations = yield np.clip([here.point + step for step in steps], 0.0, 1.0)
+        observations = yield np.clip([here.point + step for step in steps], 0.0, self._upper)
         costs = [here.loss.cost(observation.residuals) for observation in observations]
         gains = [here.cost - here.predicted(step) for step in steps]
         chosen = int(np.argmin(costs))
@@ -345,7 +348,7 @@ class LeastSquares(Search):
         for _ in range(2):
             if not len(columns):
                 break
-            leaving = (here.point + sizes > 1) | (here.point + sizes < 0)
+            leaving = (here.point + sizes > self._upper) | (here.point + sizes < 0)
             sizes = np.where(leaving, -sizes, sizes)
             sides = Differences.one_sided(here.point, columns, sizes)
             batch = yield sides.points

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Search: a method that asks for points of the unit cube and receives their observations."""
+"""Search: a method that asks for points of the box and receives their observations."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Generator, Sequence, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_calibration.evaluation.linearisation import Linearisation
+from dlo_calibration.evaluation.linearisation import Ends, Linearisation
 from dlo_calibration.model.chain import Floats, frozen_array
 
 
@@ -20,7 +20,7 @@ class Observation:
     """
     The result of evaluating one point.
 
-    :param point: (d,) in the unit cube.
+    :param point: (d,) in the box.
     :param score: difference score, to be minimised; infinite where the simulation failed.
     :param residuals: (m,) [m] simulated minus observed coordinates of all
         trials; None where the simulation failed.
@@ -34,13 +34,15 @@ class Observation:
 @dataclass(frozen=True)
 class Hints:
     """
-    The prior knowledge of a search, in the unit cube of d parameters.
+    The prior knowledge of a search, in the box of d parameters.
 
     :param start: (d,) prior estimate; nan where there is none.
     :param excited: (d,) False where no trial can show the effect of a parameter.
     :param refines: `start` is the result for a simpler model, so that the search starts only there.
-    :param jacobian: (m, d) of the residuals at `start` [m per unit cube]; None: unknown.
+    :param jacobian: (m, d) of the residuals at `start` [m per unit]; None: unknown.
     :param coarse: the search ends where a step gains little, before it has converged.
+    :param upper: (d,) upper ends of the box, or one for all; the lower ones are 0.
+    :param middle: (d,) of the start points: see `spread`.
     """
 
     start: Floats
@@ -48,20 +50,40 @@ class Hints:
     refines: bool = False
     jacobian: Floats | None = None
     coarse: bool = False
+    upper: Ends = 1.0
+    middle: Ends = 0.5
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'start', frozen_array(self.start))
         object.__setattr__(self, 'excited', frozen_array(self.excited, bool))
 
     @classmethod
-    def none(cls, dimension: int) -> Hints:
+    def none(cls, dimension: int, upper: Ends = 1.0) -> Hints:
         """Return hints without an estimate; all parameters count as excited."""
-        return cls(np.full(dimension, np.nan), np.ones(dimension, np.bool_))
+        return cls(np.full(dimension, np.nan), np.ones(dimension, np.bool_), upper=upper)
 
     @classmethod
-    def at(cls, start: Floats, jacobian: Floats | None = None, coarse: bool = False) -> Hints:
+    def at(cls, start: Floats, jacobian: Floats | None = None, coarse: bool = False, upper: Ends = 1.0
+           ) -> Hints:
         """Return hints with the result (d,) of a search with a simpler model as the only start."""
-        return cls(start, np.ones(len(start), np.bool_), True, jacobian, coarse)
+        return cls(start, np.ones(len(start), np.bool_), True, jacobian, coarse, upper)
+
+    def spread(self, shares: Floats | float) -> Floats:
+        """Return start points, (n, d), for shares of 0 to 1."""
+        return spread(self.middle, self.upper, shares)
+
+
+def spread(middle: Ends, upper: Ends, shares: Floats | float) -> Floats:
+    """
+    Return points, (n, d), that fill one unit of each parameter, as far as its scale allows around the middle.
+
+    All over a wider scale, most of few points would be far from any DLO like those before.
+
+    :param middle: (d,), or one for all; `upper` the upper ends of the box, likewise.
+    :param shares: (n, d) of the unit, 0 to 1.
+    """
+    width = np.minimum(upper, 1.0)
+    return np.asarray(np.clip(middle - width / 2, 0.0, upper - width) + width * shares)
 
 
 Result = TypeVar('Result')
@@ -71,7 +93,7 @@ Batches = Generator[Floats, Sequence[Observation], Result]
 
 class Search:
     """
-    A minimiser over the unit cube; it never sees a trial or a physical unit.
+    A minimiser over the box; it never sees a trial or a physical unit.
 
     A method derives from it, and yields batches of points in `_batches`.  A batch may be asked in portions of
     any size: the points depend neither on the portions nor on the number of workers.
@@ -86,6 +108,7 @@ class Search:
     def __init__(self, dimension: int, seed: int, hints: Hints | None = None) -> None:
         self._dimension, self._seed = dimension, seed
         self._hints = Hints.none(dimension) if hints is None else hints
+        self._upper: Floats = np.broadcast_to(self._hints.upper, dimension)  # ends of the box
         self._lowest: Observation | None = None
         self._under_way: Batches[str] | None = None
         self._batch: Floats = np.zeros((0, dimension))

@@ -11,18 +11,18 @@ from dlo_calibration.errors import InputError
 from dlo_calibration.search.protocol import Batches, Search
 
 BATCH = 300  # random points; threads wait at the end of a batch, and its residuals are in memory until then
-DONE_SIGMA = 1e-3  # standard deviation of new points, in the unit cube, below which it has converged
+DONE_SIGMA = 1e-3  # standard deviation of new points, in units of a search, below which it has converged
 
 
 class RandomSearch(Search):
-    """Draw points uniformly from the unit cube, whatever hints and results say; it never ends by itself."""
+    """Draw points uniformly from the box, whatever hints and results say; it never ends by itself."""
 
     name = 'random'
 
     def _batches(self) -> Batches[str]:
         generator = np.random.default_rng(self._seed)
         while True:
-            yield generator.random((BATCH, self._dimension))
+            yield self._upper * generator.random((BATCH, self._dimension))
 
 
 class CmaEs(Search):
@@ -42,15 +42,16 @@ class CmaEs(Search):
             raise InputError('search cma_es', 'the Python library cma is not installed', 'that library',
                              'install it (pip install cma), or choose another search') from error
         generator = np.random.default_rng(self._seed)
-        start = np.where(np.isnan(self._hints.start), 0.5, np.clip(self._hints.start, 0, 1))
+        start = np.clip(self._hints.start, 0, self._upper)
+        start = np.where(np.isnan(start), self._hints.spread(0.5), start)
         # A seed of cma would seed NumPy's global generator, so it gets `randn` instead.  The score has no
-        # tolerance.  The first deviation is 0.25: the whole range lies within two of them from its centre.
+        # tolerance.  The first deviation is 0.25: most ranges lie within two of them from their centre.
         strategy = cma.CMAEvolutionStrategy(start, 0.25, {
-            'bounds': [0, 1], 'seed': np.nan, 'randn': lambda *shape: generator.standard_normal(shape),
-            'verbose': -9, 'tolx': DONE_SIGMA, 'tolfun': 0, 'tolfunhist': 0, 'maxiter': np.inf,
-            'maxstd': np.inf})
+            'bounds': [0, self._upper.tolist()], 'seed': np.nan, 'verbose': -9, 'tolx': DONE_SIGMA,
+            'randn': lambda *shape: generator.standard_normal(shape), 'tolfun': 0, 'tolfunhist': 0,
+            'maxiter': np.inf, 'maxstd': np.inf})
         while not strategy.stop():
-            points = np.clip(strategy.ask(), 0.0, 1.0)
+            points = np.clip(strategy.ask(), 0.0, self._upper)
             observations = yield points
             scores = np.array([observation.score for observation in observations])
             good = np.isfinite(scores)

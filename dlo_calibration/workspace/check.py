@@ -23,7 +23,7 @@ from dlo_calibration.evaluation.pool import Threads
 from dlo_calibration.files.result import Description
 from dlo_calibration.inference.comparison import compare, Comparison
 from dlo_calibration.inference.uncertainty import IDENTIFIABLE_WIDTH
-from dlo_calibration.model.parameters import BY_NAME, interval, measured, number, SCALE
+from dlo_calibration.model.parameters import BY_NAME, extents, interval, measured, number, SCALE
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.search import Hints, LeastSquares
 from dlo_calibration.workspace.validation import FURTHER, SAME, validated
@@ -76,7 +76,8 @@ def checked(file: Description, trials: Sequence[Trial], options: Options,
     space = replace(space, fixed={**space.fixed, **space.values(point)})
     with closing(make_simulator(options)) as simulator, closing(Threads(options.workers)) as threads:
         setting = Setting(tuple(trials), options, simulator, threads, should_stop)
-        search = LeastSquares(space.dimension, options.seed, Hints(point, np.ones(len(point), np.bool_)))
+        search = LeastSquares(space.dimension, options.seed, Hints(
+            point, np.ones(len(point), np.bool_), upper=space.upper))
         # The error of nodes and time step is much the same in both, and that of the result counts.
         there = examined(setting, fit(setting, space, search, budget(space.dimension)), discretised=False)
     if there.examination is None or not there.examination.regular:
@@ -89,8 +90,8 @@ def checked(file: Description, trials: Sequence[Trial], options: Options,
 
 
 def covariance(file: Description, names: Sequence[str]) -> Any:
-    """Return the (d, d) covariance of parameters of a result, in the unit cube."""
-    std = np.array([file.parameters[name].std for name in names]) / SCALE
+    """Return the (d, d) covariance of parameters of a result, in units of a search."""
+    std = np.array([file.parameters[name].std for name in names]) / SCALE * extents(names)
     given = file.correlations
     correlations = np.eye(len(names)) if given is None else np.array(
         [[given[name][other] for other in names] for name in names])
@@ -132,8 +133,8 @@ def _changes(file: Description, validation: CalibrationResult, comparison: Compa
     for name, change, lower, upper, changed in zip(
             validation.space.free, comparison.change, comparison.lower, comparison.upper, comparison.changed,
             strict=True):
-        before = file.parameters[name]
-        now, *ends = (validation.space.reported(name, float(np.clip(before.value + SCALE * by, 0, SCALE)))[0]
+        before, scale = file.parameters[name], SCALE / BY_NAME[name].extent
+        now, *ends = (validation.space.reported(name, float(np.clip(before.value + scale * by, 0, SCALE)))[0]
                       for by in (change, lower, upper))
         low, high = sorted(ends)
         unit, quantity = before.physical_unit, BY_NAME[name].quantity
@@ -153,7 +154,7 @@ def plain_check(check: Check) -> Mapping[str, Any]:
     comparison, values = check.comparison, plain(check.validation)
     for k, name in enumerate(check.validation.space.free if comparison is not None else ()):
         assert comparison is not None
-        change, lower, upper = (SCALE * float(each[k]) for each in (
+        change, lower, upper = (SCALE / BY_NAME[name].extent * float(each[k]) for each in (
             comparison.change, comparison.lower, comparison.upper))
         values['parameters'][name].update(
             change=change, lower=lower, upper=upper, changed=bool(comparison.changed[k]))

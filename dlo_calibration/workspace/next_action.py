@@ -25,7 +25,7 @@ from dlo_calibration.inference.target import wanted_deviations
 from dlo_calibration.inference.uncertainty import DEVIATIONS
 from dlo_calibration.model.action import Action
 from dlo_calibration.model.chain import Chain, Floats
-from dlo_calibration.model.parameters import SCALE
+from dlo_calibration.model.parameters import BY_NAME, extents, SCALE
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.noise import noise_of
 from dlo_calibration.observation.table import lying_level
@@ -54,7 +54,7 @@ class NextAction:
     The action to do next, or why there is none.
 
     :param names: of the d parameters.
-    :param std: (d,) their present standard deviations in the unit cube.
+    :param std: (d,) their present standard deviations in units of a search.
     :param wanted: (d,) those to reach; inf: any.
     :param expected: (d,) those after the action.
     :param action: the paths of the hands; None: the calibration is at its end.
@@ -90,7 +90,8 @@ class NextAction:
     @property
     def distances(self) -> dict[str, tuple[float, float, float]]:
         """The half widths of the 90 % intervals on the 0..100 scale: present, expected, wanted; by name."""
-        widths = DEVIATIONS * SCALE * np.stack([self.std, self.expected, self.wanted], axis=1)
+        widths = DEVIATIONS * np.stack([self.std, self.expected, self.wanted], axis=1)
+        widths = widths * (SCALE / extents(self.names))[:, None]
         return {name: (now, then, wanted) for name, (now, then, wanted) in zip(
             self.names, widths.tolist(), strict=True) if math.isfinite(wanted)}
 
@@ -168,7 +169,7 @@ class _Seeker:
         self._length = mean_length(appraised.trials) if appraised.trials else start.length
         known = self._uncertainty
         local = known.std**2 if known.local is None else np.diag(known.local)
-        bound = (known.lower <= 0) | (known.upper >= 1)
+        bound = (known.lower <= 0) | (known.upper >= known.ends)
         self._trust = np.where(bound, np.clip(np.sqrt(local) / known.std, LEAST_TRUST, 1.0), 1.0)
         level = noise_of([start.points[None]])
         self._scale = float(np.hypot(ERRORS * np.nan_to_num(level), MODEL_ERROR * self._length))
@@ -251,7 +252,8 @@ class _Seeker:
         nothing, words = self._nothing, []
         for name, now, after, wanted in zip(nothing.names, nothing.std, then, nothing.wanted, strict=True):
             if now > wanted and after > REACHED * wanted:
-                ends = [f'{DEVIATIONS * SCALE * each:.1f}' for each in (now, after, wanted)]
+                scale = SCALE / BY_NAME[name].extent
+                ends = [f'{DEVIATIONS * scale * each:.1f}' for each in (now, after, wanted)]
                 words.append(f'{name}: ± {ends[0]} of 100 now, ± {ends[1]} after {MOST_TRIALS} more trials, '
                              f'± {ends[2]} is wanted')
         said = sorted(self._inquiries.refusals, key=lambda text: -self._inquiries.refusals[text])[:2]

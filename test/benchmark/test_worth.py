@@ -116,7 +116,7 @@ def test_a_belief_is_that_of_a_calibrated_dlo():
     assert truth.best == pytest.approx(ROPE.physical)
     assert truth.draws(2, 1) == [truth.best, truth.best]
     default = Posterior.of(Belief.certain(DEFAULT, ROPE)).best
-    assert default['flexibility'] == BY_NAME['flexibility'].physical(50)
+    assert default['flexibility'] == BY_NAME['flexibility'].physical(65.4)
     assert default['mass'] == ROPE.mass
     session = read_session(samples() / ROPE.name)
     observed = Observed(session.trials[:2], replace(session.options, evaluations=20))

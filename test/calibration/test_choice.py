@@ -31,7 +31,7 @@ from dlo_calibration.workspace.live_information import LiveInformation
 
 ALL = (*PAPER_PARAMETERS, *IN_MOTION, *BETWEEN_CLAMPS)
 QUICK = Options(nodes=16, engine='compiled', workers=1, table=False, mass=0.03)
-TRUTH = {'flexibility': 45.0, 'damping': 60.0, 'internal_damping': 40.0, 'torsion': 70.0}
+TRUTH = {'flexibility': 61.9, 'damping': 60.0, 'internal_damping': 40.0, 'torsion': 70.0}
 
 
 def stream():

@@ -157,7 +157,7 @@ def test_a_result_is_not_usable_on_trials_of_another_dlo(tmp_path):
     trials, _ = collected(messages())
     assert not validated(file, trials, options).unusable
     stiff = replace(file, parameters={**file.parameters, 'flexibility': replace(
-        file.parameters['flexibility'], value=10.0)})
+        file.parameters['flexibility'], value=37.7)})
     assert re.match(r'the mean error is \d+\.?\d* times that of the calibration', validated(
         stiff, trials, options).unusable)
 

@@ -19,7 +19,7 @@ from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.report.drawing import Drawn, trial_panels
 from dlo_calibration.search import SEARCHES
 
-FLEXIBILITY = 55.0
+FLEXIBILITY = 68.8
 POINTS = 16
 
 

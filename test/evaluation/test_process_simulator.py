@@ -30,7 +30,7 @@ from dlo_calibration.simulation.protocol import Stop
 ROOT = Path(__file__).resolve().parents[2]
 BOX = ('<robot name="box"><link name="box"><collision><geometry><box size="0.1 0.1 0.1"/></geometry>'
        '</collision></link></robot>')
-MIDDLE, LIMP = [0.5] * 4, [0.99] * 4
+MIDDLE, LIMP = [0.5] * 4, 0.99 * ParameterSpace().upper
 PATIENCE = 60.0
 
 

@@ -206,7 +206,7 @@ TEXT = request(LiftAndHold(point=1), PushDown(point=0, start=20.0), PATHS,
 
 
 @pytest.mark.parametrize('old, new, match', [
-    ('version="1"', 'version="2"', "<calibration_request>.*version.*'2'"),
+    ('version="2"', 'version="3"', "<calibration_request>.*version.*'3'"),
     ('<object mass="', '<object mass="-', '<object>.*mass'),
     ('<object mass="', '<object mass="heavy', '<object>.*mass.*a finite number'),
     ('<object ', '<object colour="red" ', '<object>.*colour'),

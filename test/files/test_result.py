@@ -26,6 +26,7 @@ from dlo_calibration.files.result import (
 )
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.parameters import ParameterSpace
+from dlo_calibration.search.protocol import Hints
 from dlo_calibration.search.sampling import RandomSearch
 
 OPTIONS = Options.of({'mass': 0.1 + 0.2, 'calibrate': ['friction', 'flexibility'], 'damping': 1 / 3})
@@ -35,7 +36,8 @@ TRUTH = {'flexibility': 41.0, 'elasticity': 30.0, 'friction': 62.0, 'self_collis
 def calibrated(seed=1, mass=0.1 + 0.2):
     space = ParameterSpace(('friction', 'flexibility'), {'elasticity': 100 / 3, 'damping': 1 / 3}, mass)
     trials = [toy_trial(TRUTH), toy_trial(TRUTH, 'trial 2', turn=0.3)]
-    return fitted(trials, space, ToySimulator(), RandomSearch(2, seed), budget=20, seed=seed)
+    search = RandomSearch(2, seed, Hints.none(2, space.upper))
+    return fitted(trials, space, ToySimulator(), search, budget=20, seed=seed)
 
 
 @pytest.fixture(scope='module')
@@ -168,8 +170,8 @@ def test_any_text_and_number_survives(tmp_path_factory, result, text, value, len
 
 
 @pytest.mark.parametrize('change, match', [
-    (('version="1"', 'version="2"'), "<dlo>.*version.*'2'.*expected one of '1'"),
-    (('<dlo version="1"', '<dlo version="1" more="1"'), "<dlo>.*'more'"),
+    (('version="2"', 'version="3"'), "<dlo>.*version.*'3'.*expected one of '1', '2'"),
+    (('<dlo version="2"', '<dlo version="2" more="1"'), "<dlo>.*'more'"),
     (('<calibration ', '<calibration colour="red" '), '<calibration>.*colour'),
     (('<fixed name="elasticity" value="', '<fixed name="elasticity" value="9'), '<fixed>.*value.*0 to 100'),
     (('<fixed name="elasticity" value="3', '<fixed name="elasticity" value="4'), '<fixed>.*; change both'),
@@ -286,3 +288,35 @@ def test_damaged_anywhere_is_read_or_refused(tmp_path_factory, result, place, oc
         read_result(path)
     except InputError as error:
         assert str(path) in str(error)
+
+
+def of_first_scale(text):
+    """Return a document as version 1 wrote it, when flexibility 0 was 0.1 N m^2: 30 was 51.538..."""
+    def old(match):
+        value = (float(match[2]) - (0 if match[1] == 'std' else 400 / 13)) * 13 / 9
+        return f'{match[1]}="{value!r}"'
+
+    def element(match):
+        return re.sub(r'\b(value|std|lower|upper)="([^"]*)"', old, match[0])
+
+    return re.sub(r'<\w+ name="flexibility"[^>]*>', element,
+                  text.replace('<dlo version="2"', '<dlo version="1"'))
+
+
+def test_a_result_of_the_first_scale_has_the_same_physical_values(file):
+    today = read_result(file)
+    file.write_text(of_first_scale(file.read_text(encoding='utf-8')), encoding='utf-8')
+    assert f'value="{today.values["flexibility"]}"' not in file.read_text(encoding='utf-8')
+    description = read_result(file)
+    assert description.physical() == pytest.approx(today.physical())
+    now, then = today.parameters['flexibility'], description.parameters['flexibility']
+    for name in ('value', 'std', 'lower', 'upper'):
+        assert getattr(then, name) == pytest.approx(getattr(now, name))
+    assert description.file_options.values['flexibility'] == pytest.approx(OPTIONS.flat()['flexibility'])
+
+
+def test_an_interval_that_the_first_scale_cut_is_still_open(file):
+    text = re.sub('(<found name="flexibility".* lower=)"[^"]*"', r'\1"0.0"',
+                  file.read_text(encoding='utf-8').replace('<dlo version="2"', '<dlo version="1"'))
+    file.write_text(text, encoding='utf-8')
+    assert read_result(file).parameters['flexibility'].lower == 0.0

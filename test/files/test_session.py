@@ -27,7 +27,7 @@ from ruamel.yaml import YAML
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.record import encode
-from dlo_calibration.files.recording import RecordingError, SessionWriter
+from dlo_calibration.files.recording import OUR_RECORD, RecordingError, SessionWriter
 from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.messages.codec import (
     ACTION,
@@ -41,6 +41,7 @@ from dlo_calibration.messages.codec import (
     read,
 )
 from dlo_calibration.model.chain import Chain
+from dlo_calibration.model.parameters import BY_NAME
 from dlo_calibration.ros.diagnostics import status
 
 TYPES = bag_types()
@@ -430,6 +431,15 @@ def test_the_last_recorded_options_are_read(tmp_path):
         write(writer)
         writer.write_options(options.flat())
     assert read_session(writer.path).options == options
+
+
+def test_recorded_options_of_the_first_scale_are_converted(tmp_path):
+    with SessionWriter(tmp_path / 'session') as writer:
+        write(writer)
+        writer._writer.add_metadata(OUR_RECORD, {'options': '{"flexibility": 50.0, "friction": 50.0}'})
+    options = read_session(writer.path).options
+    assert BY_NAME['flexibility'].physical(options.values['flexibility']) == pytest.approx(10**-3.25)
+    assert options.values['friction'] == 50.0
 
 
 def test_a_replay_uses_the_messages_of_the_calibration(tmp_path):

@@ -21,7 +21,7 @@ NOISE = 1e-3
 
 
 def linear(seed=0):
-    """Return a (m, 2) Jacobian [m per unit cube]."""
+    """Return a (m, 2) Jacobian [m per unit]."""
     return 0.1 * np.random.default_rng(seed).normal(size=(ROWS, 2))
 
 

@@ -11,16 +11,17 @@ import pytest
 from dlo_calibration import calibrate
 from dlo_calibration.files.session import read_session, samples
 from dlo_calibration.inference.together import known_together
-from dlo_calibration.model.parameters import BY_NAME
+from dlo_calibration.model.parameters import BY_NAME, extents
 from dlo_calibration.report.sentences import sentences
 
 NAMES = ('flexibility', 'friction', 'elasticity')
-LOGARITHMS = np.array([np.log(BY_NAME[name].at_hundred / BY_NAME[name].at_zero) for name in NAMES])
+LOGARITHMS = np.array([np.log(BY_NAME[name].at_hundred / BY_NAME[name].at_zero) for name in NAMES]
+                      ) / extents(NAMES)
 DEVIATIONS = 1.645
 
 
 def covariance(ratio, alone, power=1.0):
-    """Return the covariance, in the unit cube, of a DLO with EI / friction^power known to `ratio`."""
+    """Return the covariance, in the box, of a DLO with EI / friction^power known to `ratio`."""
     along = np.array([power, 1.0, 0.0]) * alone
     physical = np.outer(along, along) + np.diag([ratio**2, 0.0, 0.01**2])
     return physical / np.outer(LOGARITHMS, LOGARITHMS)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from carried_trials import EVEN, observed, STIFF_MIDDLE, TRUTH
 from fitted import fitted
+import numpy as np
 import pytest
 
 from dlo_calibration.calibration.options import Options
@@ -16,13 +17,19 @@ from dlo_calibration.calibration.stages import with_missing_parameters
 from dlo_calibration.inference.missing_parameters import _candidates, PARTS
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.report.sentences import sentences
-from dlo_calibration.search import LeastSquares
+from dlo_calibration.search import Hints, LeastSquares
 from dlo_calibration.simulation.compiled import CompiledSimulator
+
+
+def search_of(space):
+    unknown, all_shown = np.full(space.dimension, np.nan), np.ones(space.dimension, np.bool_)
+    return LeastSquares(space.dimension, 1, Hints(
+        unknown, all_shown, upper=space.upper, middle=space.default_point()))
 
 
 def calibrated(trials, space=EVEN):
     simulator = CompiledSimulator(table=False, nodes=21)
-    result = fitted(trials, space, simulator, LeastSquares(space.dimension, 1), budget=40)
+    result = fitted(trials, space, simulator, search_of(space), budget=40)
     return with_missing_parameters(Setting(result.trials, Options(parts=1), simulator), result)
 
 
@@ -75,6 +82,6 @@ def test_a_parameter_without_effect_of_its_own_is_not_simulated():
 def test_a_stop_leaves_the_result_as_it_is():
     trials = observed(ParameterSpace((*EVEN.free, 'length_scale')), {**TRUTH, 'length_scale': 40.0})
     simulator = CompiledSimulator(table=False, nodes=21)
-    result = fitted(trials, EVEN, simulator, LeastSquares(EVEN.dimension, 1), budget=12)
+    result = fitted(trials, EVEN, simulator, search_of(EVEN), budget=12)
     setting = Setting(result.trials, Options(), simulator, should_stop=lambda: True)
     assert with_missing_parameters(setting, result) is result

@@ -23,13 +23,14 @@ from dlo_calibration.inference.trial_information import (
 from dlo_calibration.inference.uncertainty import UNKNOWN_STD
 from dlo_calibration.model.parameters import knot_names, ParameterSpace
 from dlo_calibration.observation.noise import noise
-from dlo_calibration.search import SEARCHES
+from dlo_calibration.search import Hints, SEARCHES
 from dlo_calibration.simulation.protocol import Rollout
 
 TRUTH = {'flexibility': 40.0, 'elasticity': 30.0, 'friction': 70.0, 'self_collision': 20.0}
 SPACE = ParameterSpace(('flexibility', 'friction'), {'elasticity': 30.0, 'self_collision': 20.0})
 FIRST = toy_trial(TRUTH, 'trial 1')
-SQUARES = REACH**2 * np.sum(np.sin(np.linspace(0, np.pi, 11))**2)  # of the derivatives, for either parameter
+BEST = SPACE.point({'flexibility': 40.0, 'friction': 70.0})
+SQUARES = (REACH / SPACE.upper)**2 * np.sum(np.sin(np.linspace(0, np.pi, 11))**2)  # of the derivatives, (2,)
 
 
 class Blind(ToySimulator):
@@ -53,7 +54,8 @@ def noisy_trial(name, seed):
 
 
 def calibrated(trials, simulator=None):
-    return fitted(trials, SPACE, simulator or ToySimulator(), SEARCHES['least_squares'](2, 1), budget=80)
+    search = SEARCHES['least_squares'](2, 1, Hints.none(2, SPACE.upper))
+    return fitted(trials, SPACE, simulator or ToySimulator(), search, budget=80)
 
 
 def appraised(trials, simulator=None, space=SPACE):
@@ -78,7 +80,7 @@ def test_components_of_a_rest_shape_are_counted():
         return TrialInformation('trial 1', names, before, before * shares).words
 
     assert words(0.5, 0.5, 0.5, 0.9, 0.5, 0.5, 0.5, 0.9) == (
-        'trial 1 makes flexibility more certain (± 20.0 -> ± 10.0 of 100), 5 of 6 components of the rest '
+        'trial 1 makes flexibility more certain (± 13.8 -> ± 6.9 of 100), 5 of 6 components of the rest '
         'shape; it adds nothing about damping')
     assert words(1, *[0.5] * 6, 1) == (
         'trial 1 makes 6 of 6 components of the rest shape more certain; it adds nothing about flexibility, '
@@ -109,7 +111,7 @@ def test_before_any_trial_all_parameters_are_unknown():
 
 def test_the_values_follow_the_trials_and_the_standard_deviation_is_that_of_linear_regression():
     _, after = appraised([noisy_trial('trial 1', 0)])
-    assert after.point == pytest.approx([0.4, 0.7], abs=0.02)
+    assert after.point == pytest.approx(BEST, abs=0.02)
     regression = (12 + SQUARES / after.uncertainty.scale**2)**-0.5
     assert (std(after) >= regression).all()  # with the noise of the initial chain, it is more
     assert (std(after) < 4 * regression).all()
@@ -137,7 +139,7 @@ def test_a_trial_informs_about_what_it_shows_and_an_exact_repeat_about_nothing()
     assert std(first)[1] == pytest.approx(UNKNOWN_STD)
     assert std(first)[0] < 0.05
     assert std(second)[1] < 0.05
-    assert std(third)[1] == pytest.approx(std(second)[1], rel=0.1)
+    assert std(third)[1] == pytest.approx(std(second)[1], rel=0.15)  # as new trials: 0.82 of it
 
 
 class Fading(ToySimulator):
@@ -149,12 +151,12 @@ class Fading(ToySimulator):
 
 
 def test_a_value_is_recovered_from_a_start_without_a_derivative():
-    start = np.array([0.4, 0.1])
+    start = SPACE.point({'flexibility': 40.0, 'friction': 10.0})
     appraisal = Appraisal.before(SPACE.free, start)
     trial = noisy_trial('trial 1', 0)
     after = Appraiser(SPACE, Pool(Fading()), 1.0, 0.0, noise([trial]), guessed=('friction',)).after(
         appraisal, [trial])
-    assert after.point == pytest.approx([0.4, 0.7], abs=0.02)
+    assert after.point == pytest.approx(BEST, abs=0.02)
     assert after.uncertainty.verdicts == ('identifiable', 'identifiable')
 
 

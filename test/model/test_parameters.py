@@ -26,7 +26,7 @@ PAPER = ('flexibility', 'elasticity', 'friction', 'self_collision')
 WEIGHT = 0.05 * 9.81  # N/m, of a DLO whose mass is not known
 
 MAPPING = {
-    'flexibility': lambda u: 10 ** (-1 - 4.5 * u / 100),
+    'flexibility': lambda u: 10 ** (1 - 6.5 * u / 100),
     'elasticity': lambda u: 10 ** (4 - 4 * u / 100),
     'friction': lambda u: 10 ** (-2 + 2.3 * u / 100),
     'self_collision': lambda u: 0.002 * 15 ** (u / 100),
@@ -40,7 +40,7 @@ def test_the_papers_four_have_their_documented_quantities(name):
 
 
 @pytest.mark.parametrize(('name', 'at_zero', 'at_hundred', 'unit'), [
-    ('flexibility', 0.1, 10**-5.5, 'N m^2'), ('elasticity', 1e4, 1.0, 'N'),
+    ('flexibility', 10.0, 10**-5.5, 'N m^2'), ('elasticity', 1e4, 1.0, 'N'),
     ('friction', 0.01, 10**0.3, '1'), ('self_collision', 0.002, 0.03, 'm')])
 def test_the_ends_of_the_scale(name, at_zero, at_hundred, unit):
     assert BY_NAME[name].physical(0) == pytest.approx(at_zero, rel=1e-12)
@@ -70,10 +70,12 @@ def test_the_default_space_has_the_four_parameters_of_the_paper():
     assert space.dimension == 4
 
 
-def test_a_point_of_the_cube_and_the_values_of_its_parameters():
+def test_a_point_of_the_box_and_the_values_of_its_parameters():
     space = ParameterSpace(('friction', 'flexibility'))
-    assert space.values([0.25, 1.0]) == {'friction': 25.0, 'flexibility': 100.0}
-    assert space.point({'flexibility': 100.0, 'friction': 25.0}).tolist() == [0.25, 1.0]
+    assert space.upper == pytest.approx([1.0, 6.5 / 4.5])
+    assert space.values([0.25, space.upper[1]]) == {'friction': 25.0, 'flexibility': 100.0}
+    assert space.point({'flexibility': 100.0, 'friction': 25.0}).tolist() == [0.25, space.upper[1]]
+    assert BY_NAME['flexibility'].coordinate(0.1) == pytest.approx(2 / 4.5)
     with pytest.raises(ValueError):
         space.values([0.5])  # a coordinate is missing
 

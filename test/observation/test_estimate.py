@@ -81,7 +81,7 @@ def test_range_of_a_cantilever_holds_the_truth(bending, seed):
     goal = observed(hung(bending, CLAMP), 31, MILLIMETRE, seed)
     estimate = prior_estimates([trial_of(goal, [(0, 1)])], SPACE, None)['flexibility']
     assert estimate.lower <= on_scale('flexibility', bending) <= estimate.upper
-    assert estimate.upper - estimate.lower < 60
+    assert estimate.upper - estimate.lower < 73
 
 
 def test_more_stretch_is_more_elastic():
@@ -126,7 +126,7 @@ def test_a_heavier_dlo_of_that_shape_is_stiffer():
     trials = [trial_of(observed(hung(1e-3, CLAMP), 31), [(0, 1)])]
     light, heavy = (prior_estimates(trials, ParameterSpace(mass=mass), None)['flexibility']
                     for mass in (MASS, 10 * MASS))
-    assert light.value - heavy.value == pytest.approx(100 / 4.5)
+    assert light.value - heavy.value == pytest.approx(100 / 6.5)
 
 
 def test_stiffness_is_not_estimated_if_the_mass_is_free():

@@ -212,6 +212,15 @@ def test_nothing_is_wrong_with_the_observation_of_a_sample(lying):
     assert observation_warnings(lying, 0.0, 0.03) == ()
 
 
+@pytest.mark.parametrize(('length', 'words'), [
+    (0.1, 'a time step of 3 ms for a DLO of 100 mm; expected at most 2.5 ms'),
+    (0.01, 'set time_step to 3e-4'), (0.3, '')])
+def test_a_step_that_is_too_long_for_a_short_dlo_is_named(length, words):
+    trial = trial_of(np.linspace([0, 0, 0.2], [length, 0, 0.2], 11), [(0,)], length=length)
+    warnings = observation_warnings([trial], None, 0.0, 3e-3)
+    assert any(words in warning for warning in warnings) if words else not warnings
+
+
 def test_the_noise_of_chains_is_named(lying):
     words, = observation_warnings(noisy(lying, 0.007), 0.0, 0.03)
     assert words.startswith('the chains: a noise of 7')

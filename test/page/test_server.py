@@ -178,7 +178,8 @@ def test_the_information_of_each_trial_is_shown_before_a_calibration(tmp_path, m
         whole_trial(page)
         state = page.until(lambda state: state['trials'][0]['information'], 'the information')
         appraised = state['trials'][0]['information']
-        assert appraised['parameters'] == {'flexibility': {'before': 30.0, 'after': 6.0}}
+        assert appraised['parameters'] == {'flexibility': pytest.approx(
+            {'before': 30.0 * 4.5 / 6.5, 'after': 6.0 * 4.5 / 6.5})}
         assert appraised['sentence'].startswith('trial 1 makes flexibility more certain')
         assert state['calibration']['state'] == 'idle'
 

@@ -48,7 +48,7 @@ def test_advice_comes_for_the_first_chain_and_after_a_trial(start):
     assert first.joint_names == ['hand_1'] and len(first.points) > 1
     heights = [point.transforms[0].translation.z for point in first.points]
     assert max(heights) - heights[0] <= 0.0801
-    assert float(graph.status['half_width_flexibility']) == pytest.approx(47.5, abs=0.1)
+    assert float(graph.status['half_width_flexibility']) == pytest.approx(47.5 * 4.5 / 6.5, abs=0.1)
     assert float(graph.status['wanted_half_width_flexibility']) == pytest.approx(0.01)
     assert graph.status['advice'].startswith('hand_1: grip')
     graph.send(messages[1:])

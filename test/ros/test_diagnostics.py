@@ -121,13 +121,13 @@ def test_status_has_state_trials_and_refusal(types, state, level):
 
 
 def test_status_says_what_the_newest_trial_adds(types):
-    information = TrialInformation('trial 2', ('flexibility', 'friction'), [0.0625, 0.25], [0.015625, 0.25])
+    information = TrialInformation('trial 2', ('elasticity', 'friction'), [0.0625, 0.25], [0.015625, 0.25])
     status, values = by_name(diagnostics.status(
         types, STAMP, {'state': 'collecting', 'detail': ''}, information))['status']
     assert values['last_trial'] == information.words
     assert {key: float(value) for key, value in values.items() if key.startswith('std_')} == {
-        'std_before_flexibility': 6.25, 'std_before_friction': 25.0,
-        'std_after_flexibility': 1.5625, 'std_after_friction': 25.0}
+        'std_before_elasticity': 6.25, 'std_before_friction': 25.0,
+        'std_after_elasticity': 1.5625, 'std_after_friction': 25.0}
     assert status.message == f'collecting; {information.words}'
     failed, values = by_name(diagnostics.status(
         types, STAMP, {'state': 'failed', 'detail': 'why'},

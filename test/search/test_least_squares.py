@@ -114,6 +114,16 @@ def test_some_points_have_the_estimate_and_others_do_not():
     assert solve(valley, hints=wrong)[0].best == pytest.approx(TRUTH, abs=0.005)
 
 
+def test_a_scale_that_becomes_wider_does_not_change_a_search():
+    _, before = solve(valley, hints=Hints([np.nan, np.nan, 0.1], [True] * 3))
+    moved = np.array([0.4, 0.0, 0.0])  # the scale of the first parameter begins lower, and ends higher
+    hints = Hints([np.nan, np.nan, 0.1], [True] * 3, upper=[1.5, 1.0, 1.0], middle=[0.9, 0.5, 0.1])
+    search, after = solve(lambda point: valley(point - moved), hints=hints)
+    assert after - moved == pytest.approx(before, abs=1e-6)
+    search, _ = solve(lambda point: valley(point - [0.8, 0, 0]), hints=hints)  # beyond all start points
+    assert search.best == pytest.approx(TRUTH + [0.8, 0, 0], abs=0.005)
+
+
 def test_an_optimum_on_the_border_is_reached():
     search = solve(lambda point: valley(point * [0.5, 1, 1]))[0]  # its minimum is at 1.24
     assert search.best[0] == 1.0

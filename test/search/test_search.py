@@ -18,7 +18,7 @@ MEASURED = [name for name in NAMES if name.values != ('random',)]  # those that 
 
 class Problem:
     """
-    Residuals in a curved valley of the unit cube; parameters listed in `flat` have no effect.
+    Residuals in a curved valley of the box; parameters listed in `flat` have no effect.
 
     :param fails: every evaluation fails.
     """

@@ -97,7 +97,8 @@ def test_rollouts_are_those_of_bullet(name):
     for trial in trials[:3]:
         # Rounding decides to which side a DLO buckles if it is too long for its place, where it is flung if
         # it is far more curved at rest, and whether strands stick or slip.
-        values = {**space.values(generator.random(len(NAMES))), 'length_scale': generator.uniform(30, 48),
+        point = generator.random(len(NAMES)) + space.upper - 1
+        values = {**space.values(point), 'length_scale': generator.uniform(30, 48),
                   'natural_curvature': generator.uniform(0, 20), 'bending_friction': 0.0,
                   'locking': 0.0,
                   **dict(zip(REST_SHAPE[1:], generator.uniform(48, 52, len(REST_SHAPE) - 1), strict=True))}

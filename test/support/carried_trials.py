@@ -16,7 +16,7 @@ from dlo_calibration.simulation.compiled import CompiledSimulator
 
 POINTS, LENGTH = 15, 0.8
 EVEN = ParameterSpace(('flexibility', 'damping'))
-TRUTH = {'flexibility': 40.0, 'damping': 50.0}
+TRUTH = {'flexibility': 58.5, 'damping': 50.0}
 STIFF_MIDDLE = {**TRUTH, 'stiffness_2': 68.0, 'stiffness_3': 68.0, 'stiffness_4': 50.0}
 NAMES = ('left_hand', 'right_hand')
 

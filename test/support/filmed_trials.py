@@ -19,7 +19,7 @@ from dlo_calibration.simulation.compiled import CompiledSimulator
 from dlo_calibration.vision.tags import QUIET, TAG_CELLS, tag_cells, TAG_SIDE
 
 LENGTH, RADIUS, MASS = 0.6, 0.004, 0.03  # m, m, kg
-TRUTH = {'flexibility': 60.0, 'elasticity': 40.0, 'friction': 65.0, 'self_collision': 25.6, 'damping': 50.0}
+TRUTH = {'flexibility': 72.3, 'elasticity': 40.0, 'friction': 65.0, 'self_collision': 25.6, 'damping': 50.0}
 NODES = 61
 RATE = 30.0  # images in a second
 WAIT, COME, REST = 1.2, 0.6, 2.6  # s before a hand comes, until it closes, and after it opens

@@ -19,10 +19,10 @@ from dlo_calibration.planning.plan import Plan, PlannedAction
 LENGTH = 0.6  # m
 LEVEL = 0.004  # m, at which its centre line rests on the table
 #: Of a limp rope: name -> value, lower and upper end of its interval.
-ROPE = {'flexibility': (66.0, 65.0, 67.0), 'elasticity': (50.0, 20.0, 80.0), 'friction': (70.0, 68.0, 72.0),
+ROPE = {'flexibility': (76.5, 75.8, 77.2), 'elasticity': (50.0, 20.0, 80.0), 'friction': (70.0, 68.0, 72.0),
         'self_collision': (25.0, 20.0, 30.0)}
 #: Of a stiff hose.
-HOSE = {**ROPE, 'flexibility': (16.0, 15.0, 17.0)}
+HOSE = {**ROPE, 'flexibility': (41.8, 41.2, 42.5)}
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.simulation.compiled import CompiledSimulator
 
 MASS, LENGTH, RADIUS = 0.03, 0.6, 0.004  # kg, m, m
-TRUTH = {'flexibility': 60.0, 'elasticity': 40.0, 'friction': 65.0, 'self_collision': 25.6, 'damping': 50.0}
+TRUTH = {'flexibility': 72.3, 'elasticity': 40.0, 'friction': 65.0, 'self_collision': 25.6, 'damping': 50.0}
 NODES, RATE, NOISE = 21, 20.0, 0.7e-3  # points of a chain; chains per second; m
 WAYS = ((0, (0.10, 0.20), 0.0), (10, (0.15, -0.18), 1.3), (20, (-0.25, 0.12), 2.6))  # grip, way [m], heading
 

@@ -109,7 +109,8 @@ def test_a_dlo_out_of_reach_is_only_tidied():
 
 
 def test_what_is_wanted_is_read_from_a_text():
-    assert read_targets('flexibility 2, friction 3.5') == {'flexibility': 0.02, 'friction': 0.035}
+    assert read_targets('flexibility 2, friction 3.5') == {
+        'flexibility': pytest.approx(0.02 * 6.5 / 4.5), 'friction': 0.035}
     assert read_targets('EI 5 %')['flexibility'] == pytest.approx(np.log(1.05) / np.log(10**4.5))
     identifiable = wanted_deviations('', ParameterSpace())
     assert 2 * DEVIATIONS * identifiable == pytest.approx([0.2] * 4)
@@ -138,7 +139,7 @@ def test_a_dlo_that_a_hand_holds_is_not_at_rest():
 def test_a_shared_error_costs_information():
     """With the toy, whose points move linearly, the standard deviations follow from the formula."""
     space = ParameterSpace(('flexibility', 'friction'))
-    trial = toy_trial({'flexibility': 40.0, 'friction': 60.0})
+    trial = toy_trial({'flexibility': 58.5, 'friction': 60.0})
     shifted = replace(trial, initial=Chain(trial.initial.points + [0.01, 0.0, 0.0]))
     unknown = Appraisal.before(space.free, space.default_point()).uncertainty
     points = np.array([[0.3, 0.4], [0.6, 0.5]])
