@@ -33,9 +33,7 @@ PLACES = 201  # along the DLO at which a hand may hold it
 MOST, ROUNDS = 60, 4  # pictures in which they are compared, and weightings of these
 DOUBTED = 0.006  # m; a picture in which a place is farther from where it is in the hand hardly counts
 BRIDGED = 0.2  # share of the length to both sides of a place, in which the DLO must be seen
-LEAVING = 0.6  # s; a hand that leaves a DLO stood still so long before they are apart, at most
 PARTED = 5  # pictures in a row that show hand and DLO apart
-SLIPPED = 0.0015  # m, by which a held point moves beside its hand when that opens
 LEFT, SIGMAS = 0.005, 5.0  # m, and times what is typical: a grip farther from its hand is left
 HELD = 0.012  # m; from a hand to the point that it holds, at most, in half of the movement's pictures
 BESIDE = 0.005  # of a grip's distance from its tag that counts as error: of places alike, the nearest is held
@@ -157,13 +155,10 @@ class _Motion:
         apart = np.full(len(path), np.nan)
         both = np.isfinite(own[:, 0]) & known
         apart[both] = _apart(seen, path[both], own[both], both)
-        way = np.linalg.norm(hand.positions - hand.positions[closes], axis=1)
+        stands = (speed < STILL) & (np.linalg.norm(hand.positions - hand.positions[closes], axis=1) > WAY)
         most = min(max(LEFT, SIGMAS * float(self.typical[place])), HELD)
-        opens = _opens(seen.times, apart, most, speed, way, closes, last)
-        stands = closes + np.flatnonzero(
-            np.linalg.norm(path[closes:opens + 1] - path[opens], axis=1) < LEFT)
+        opens = _opens(seen.times, apart, most, stands, closes, last)
         low = path if seen.cameras is None else _dragged(seen, path)
-        opens = _slips(low - own, closes, opens, stands)
         held = slice(closes, opens + 1)
         moving = path[held][(speed[held] >= STILL) & known[held]]
         lifts = seen.cameras is None or bool(
@@ -260,59 +255,26 @@ def _dragged(seen: Sightings, path: Floats) -> Floats:
     return np.asarray(seen.cameras + share * (path - seen.cameras))
 
 
-def _opens(times: Floats, apart: Floats, most: float, speed: Floats, way: Floats, closes: int,
+def _opens(times: Floats, apart: Floats, most: float, stands: NDArray[np.bool_], closes: int,
            last: int) -> int:
     """
-    Return the picture in which a hand opens: the last one before hand and DLO part.
+    Return the picture in which a hand opens.
 
-    A hand that moves away has stood still before.  While both stay together, it opens when it has come to a
-    standstill: nothing shows that it holds the DLO any longer.
+    A hand that comes to a standstill before the DLO rests may hold it longer, but nothing shows that, and
+    nothing moves.  A hand that does not opens before both part, or when the DLO rests.
 
     :param apart: (n,) how far both are apart [m]; NaN where this is unknown.
     :param most: how far they are apart while the hand holds the DLO [m].
-    :param way: (n,) of the hand from where it closed [m].
+    :param stands: (n,) whether the hand stands still, elsewhere than where it closed.
+    :param last: the last picture in which the DLO moves.
     """
-    end = int(np.searchsorted(times, times[last] + 1.0))
-    known = closes + np.flatnonzero(np.isfinite(apart[closes:end]))
-    together = known[apart[known] < most]
-    parts = [k for k in together if (apart[known[known > k][:PARTED]] >= most).all()]
-    parted = bool(parts) and bool((known > parts[0]).sum() >= PARTED)
-    held = parts[0] if parted else together[-1] if len(together) else closes
-    unseen = np.arange(held + 1, known[known > held][0] if (known > held).any() else end)
-    moves = closes + np.flatnonzero(speed[closes:end] >= STILL)
-    stood = unseen[(speed[unseen] < STILL) & (way[unseen] > WAY)]
-    if len(stood):  # they part while this is not seen, after the hand has come to a standstill
-        return int(np.split(stood, np.flatnonzero(np.diff(stood) > 1) + 1)[0][0])
-    if len(unseen) and times[unseen[-1]] - times[held] > LEAVING:
-        return int(np.clip(last, held, unseen[-1]))
-    if parted:
-        for before in together[together < held][::-1]:  # they begin to part
-            if not apart[held] > max(apart[before] + most / 4, most / 2):
-                break
-            held = before
-        stood = together[(speed[together] < STILL) & (times[together] > times[held] - LEAVING)
-                         & (together <= held)]
-        return int(stood[-1] if len(stood) else held)
-    moves = moves[moves <= held]
-    stands = min(int(moves[-1]) + 1 if len(moves) else held, held)
-    return int(max(stands, min(last, held)))
-
-
-def _slips(apart: Floats, closes: int, opens: int, stands: NDArray[np.intp]) -> int:
-    """
-    Return the picture in which a hand opens: the last one before the DLO begins to move without it.
-
-    :param apart: (n, 3) from the hand's grip to the place that it holds [m]; NaN where unknown.
-    :param stands: pictures in which the hand stands where it opens.
-    """
-    known = closes + np.flatnonzero(np.isfinite(apart[closes:opens + 1, 0]))
-    for k in range(PARTED, len(known)):
-        if known[k] not in stands:
-            continue
-        usual = np.median(apart[known[k - PARTED:k]], axis=0)
-        if (np.linalg.norm(apart[known[k:]] - usual, axis=1) > SLIPPED).all():
-            return int(known[k - 1])
-    return opens
+    end = int(np.searchsorted(times, times[last] + 2.0 * SPAN))
+    known = closes + np.flatnonzero(np.isfinite(apart[closes:]))
+    away = apart[known] >= most
+    parted = known[[k for k in range(len(known) - PARTED + 1) if away[k:k + PARTED].all()]]
+    end = min(end, *parted[:1])
+    begins = closes + 1 + np.flatnonzero(stands[closes + 1:end] & ~stands[closes:end - 1])
+    return int(begins[-1]) if len(begins) else max(min(last, end - 1), closes)
 
 
 def _apart(seen: Sightings, grips: Floats, points: Floats, pictures: NDArray[np.bool_]) -> Floats:
