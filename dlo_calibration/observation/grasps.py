@@ -98,14 +98,16 @@ def _moved_by(seen: Sightings, hand: HandSightings, speed: Floats, initial: Chai
     # It has come to a standstill before it moves again, with the DLO.
     still = near[speed[near] < STILL]
     stands = np.split(still, np.flatnonzero(np.diff(still) > 1) + 1)[0]
-    closes = int(stands[-1]) if len(still) else int(near[speed[near].argmin()])
-    if np.linalg.norm(hand.positions[span] - hand.positions[closes], axis=1).max() < WAY:
+    closes = int(stands[-1]) if len(still) else max(first - 1, 0)
+    shown = closes if len(still) else int(span[0])
+    begin = hand.positions[shown]
+    if np.linalg.norm(hand.positions[span] - begin, axis=1).max() < WAY:
         return None
     there = near[near <= closes]
-    there = there[np.linalg.norm(hand.positions[there] - hand.positions[closes], axis=1) < AT_REST]
+    there = there[np.linalg.norm(hand.positions[there] - begin, axis=1) < AT_REST]
     compared = span[np.unique(np.linspace(0, len(span) - 1, min(len(span), MOST)).astype(int))]
     turned = [np.tile(NO_ROTATION, (len(times), 1))] if hand.orientations is None else [
-        hand.orientations, _about_vertical(hand.orientations, closes)]
+        hand.orientations, _about_vertical(hand.orientations, shown)]
     motion = min((_motion(seen, hand, rotations, initial, closes, there, compared) for rotations in turned),
                  key=lambda motion: motion.costs.min())
     return motion if motion.typical[motion.costs.argmin()] < HELD else None
@@ -155,7 +157,8 @@ class _Motion:
         apart = np.full(len(path), np.nan)
         both = np.isfinite(own[:, 0]) & known
         apart[both] = _apart(seen, path[both], own[both], both)
-        stands = (speed < STILL) & (np.linalg.norm(hand.positions - hand.positions[closes], axis=1) > WAY)
+        begin = hand.positions[closes:][known[closes:]][0]
+        stands = (speed < STILL) & (np.linalg.norm(hand.positions - begin, axis=1) > WAY)
         most = min(max(LEFT, SIGMAS * float(self.typical[place])), HELD)
         opens = _opens(seen.times, apart, most, stands, closes, last)
         low = path if seen.cameras is None else _dragged(seen, path)
@@ -210,7 +213,8 @@ def _motion(seen: Sightings, hand: HandSightings, turns: Floats, initial: Chain,
     tags = hand.positions[pictures, None]
     slopes = across @ rotations[:, None]  # (k, PLACES, 3, 3)
     values = (across @ (points - tags)[..., None])[..., 0]
-    offsets = np.einsum('kba,kpb->pa', rotations[:len(there)], resting - tags[:len(there)]) / len(there)
+    first = max(len(there), 1)
+    offsets = np.einsum('kba,kpb->pa', rotations[:first], points[:first] - tags[:first]) / first
     for _ in range(ROUNDS):
         apart = np.linalg.norm(np.einsum('kpab,pb->kpa', slopes, offsets) - values, axis=2)
         weights = 1.0 / np.square(1.0 + np.square(apart / DOUBTED))  # Geman and McClure's

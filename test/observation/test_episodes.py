@@ -110,6 +110,18 @@ def test_a_hand_that_pauses_on_its_way_holds_the_dlo():
     assert episode.hands[0].end == pytest.approx(OPENS + 12 / 30, abs=0.1)
 
 
+def test_a_hand_whose_tag_is_not_seen_as_it_closes_has_closed_when_the_dlo_begins_to_move():
+    seen, hand, grip = filmed_hand()
+    hidden = (seen.times > CLOSES - 0.5) & (seen.times < CLOSES + 0.4)
+    positions = np.where(hidden[:, None], np.nan, hand.positions)
+    (episode,), problems = episodes(seen, [replace(hand, positions=positions)])
+    assert not problems
+    path, = episode.hands
+    assert path.start == pytest.approx(CLOSES, abs=0.2)
+    truth = np.stack([np.interp(path.times, seen.times, axis) for axis in grip.T], axis=1)
+    assert np.linalg.norm(path.positions - truth, axis=1).max() < 0.01
+
+
 def test_a_hand_that_goes_on_without_the_dlo_has_opened():
     seen, hand, _ = filmed_hand()
     drops = int(np.searchsorted(seen.times, (CLOSES + OPENS) / 2))
