@@ -42,6 +42,9 @@ from dlo_calibration.vision.two_views import axis_of_two_views
 
 SNAP = 0.25  # spacings of a chain: a hand nearer than this to an end, or to another grip, is put there
 
+#: Slow errors of a film, as rendered ones have them (benchmark/film_trials.py).
+FILM_ERRORS = {'slow_chain_error': 0.0005, 'slow_hand_error': 0.002}
+
 
 @dataclass(frozen=True, eq=False)
 class TrialDraft:
@@ -227,7 +230,7 @@ class Drafts:
     @property
     def options(self) -> dict[str, Any]:
         """The options of these trials, by name."""
-        return measured_options(self.diameter, self.mass)
+        return measured_options(self.diameter, self.mass, filmed=self.filmed_diameter is not None)
 
     def plain(self) -> dict[str, Any]:
         """Return the drafts as plain values, for the page."""
@@ -282,7 +285,7 @@ class Drafter:
                       place_obstacles(document, photographs))
 
 
-def measured_options(diameter: float | None, mass: float = 0.0) -> dict[str, Any]:
+def measured_options(diameter: float | None, mass: float = 0.0, *, filmed: bool = False) -> dict[str, Any]:
     """
     Return the options of trials that a camera observed, by name.
 
@@ -290,8 +293,11 @@ def measured_options(diameter: float | None, mass: float = 0.0) -> dict[str, Any
 
     :param diameter: of the DLO [m]; None: unknown.
     :param mass: of the DLO [kg]; 0: unknown.
+    :param filmed: whether a film shows trials.
     """
     options: dict[str, Any] = {'table': True, 'table_height': 0.0, 'mass': mass}
+    if filmed:
+        options |= FILM_ERRORS
     if diameter is not None:
         value = BY_NAME['self_collision'].value(diameter / 2)
         options['self_collision'] = min(max(value, 0.0), SCALE)
