@@ -211,6 +211,13 @@ class Options(DeclaredOptions):
     hand_shift_x: float = _hand_shift('x')
     hand_shift_y: float = _hand_shift('y')
     hand_shift_z: float = _hand_shift('z')
+    slow_chain_error: float = declared(
+        0.0, 'standard deviation of errors that neighbouring points of a chain share, as those of a film; '
+        'they widen the intervals as far as they move the values; 0: none', unit='m', minimum=0.0,
+        maximum=0.1, of=OBSERVATION)
+    slow_hand_error: float = declared(
+        0.0, 'standard deviation of the place along the DLO that a hand grips; its way is off by a third of '
+        'it; likewise', unit='m', minimum=0.0, maximum=0.1, of=OBSERVATION)
     calibrate: tuple[str, ...] = declared(
         (AUTO,), "names of the parameters to find; all others keep their fixed value; auto: the paper's four "
         '(flexibility, elasticity, friction, self_collision), and what the trials show besides: damping and '

@@ -43,6 +43,7 @@ from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import BY_NAME, ParameterSpace, REST_SHAPE
 from dlo_calibration.model.score import observed
 from dlo_calibration.observation.noise import NO_NOISE, noise, with_other_noise
+from dlo_calibration.observation.slow_errors import with_slow_errors
 from dlo_calibration.search import Hints, LeastSquares
 from dlo_calibration.simulation.protocol import Rollout, Simulator
 
@@ -95,9 +96,11 @@ def _examined(setting: Setting, fit: Fit, discretised: bool) -> tuple[Examinatio
         starts = [restart.begin(here) for restart in restarts]
         hands = [setting.evaluate(_with_hand(space, setting, name)).begin(here)
                  for name in setting.choice.corrected]
+        slow = [setting.evaluate(space, others).begin(here) for others in with_slow_errors(
+            trials, setting.options.slow_chain_error, setting.options.slow_hand_error)]
         examination = examine(
             best.point, best.residuals, ResidualLayout.compared(trials), evaluate.residuals,
-            default=default, noise=sigma, finer=fine, starts=starts, hands=hands,
+            default=default, noise=sigma, finer=fine, starts=starts, hands=hands, slow=slow,
             restarted=[restart.residuals for restart in restarts],
             fading=np.array([name not in REST_SHAPE for name in space.free]), upper=space.upper)
     finally:

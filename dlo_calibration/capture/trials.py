@@ -43,6 +43,9 @@ from dlo_calibration.vision.two_views import axis_of_two_views
 
 SNAP = 0.25  # spacings of a chain: a hand nearer than this to an end, or to another grip, is put there
 
+#: Slow errors of a film, as rendered ones have them (benchmark/film_trials.py).
+FILM_ERRORS = {'slow_chain_error': 0.0005, 'slow_hand_error': 0.002}
+
 
 @dataclass(frozen=True, eq=False)
 class TrialDraft:
@@ -246,7 +249,8 @@ class Drafts:
     def options(self) -> dict[str, Any]:
         """The options of these trials, by name."""
         hang = [draft.hangs for draft in self.trials]
-        options = measured_options(self.diameter, with_ends(self.mass) if hang and all(hang) else self.mass)
+        options = measured_options(self.diameter, with_ends(self.mass) if hang and all(hang) else self.mass,
+                                   filmed=self.filmed_diameter is not None)
         return {**options, 'nodes': NODES} if any(hang) else options
 
     def plain(self) -> dict[str, Any]:
@@ -302,7 +306,7 @@ class Drafter:
                       place_obstacles(document, photographs))
 
 
-def measured_options(diameter: float | None, mass: float = 0.0) -> dict[str, Any]:
+def measured_options(diameter: float | None, mass: float = 0.0, *, filmed: bool = False) -> dict[str, Any]:
     """
     Return the options of trials that a camera observed, by name.
 
@@ -310,8 +314,11 @@ def measured_options(diameter: float | None, mass: float = 0.0) -> dict[str, Any
 
     :param diameter: of the DLO [m]; None: unknown.
     :param mass: of the DLO [kg]; 0: unknown.
+    :param filmed: whether a film shows trials.
     """
     options: dict[str, Any] = {'table': True, 'table_height': 0.0, 'mass': mass}
+    if filmed:
+        options |= FILM_ERRORS
     if diameter is not None:
         value = BY_NAME['self_collision'].value(diameter / 2)
         options['self_collision'] = min(max(value, 0.0), SCALE)

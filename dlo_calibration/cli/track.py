@@ -89,7 +89,7 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
         if trials:
             messages = episode_messages([own.episode for own in trials], FRAME, ZERO)
             write_records(chosen.output / SESSION, message_records(messages),
-                          measured_options(round(2.0 * filming.radius, 4)))
+                          measured_options(round(2.0 * filming.radius, 4), filmed=True))
         _draw(film, views, chosen.output / TRACKED)
     elapsed = time.perf_counter() - begin
     report = _report(views, filming, trials, problems, spent, elapsed)

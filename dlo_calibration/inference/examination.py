@@ -80,8 +80,8 @@ class Examination:
 def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: Evaluate, *,
             default: Floats, noise: float, finer: Pending | None = None,
             starts: Sequence[Pending] = (), restarted: Sequence[Evaluate] = (),
-            hands: Sequence[Pending] = (), fading: NDArray[np.bool_] | None = None, upper: Ends = 1.0
-            ) -> Examination:
+            hands: Sequence[Pending] = (), slow: Sequence[Pending] = (),
+            fading: NDArray[np.bool_] | None = None, upper: Ends = 1.0) -> Examination:
     """
     Examine the (d,) `point` of the box, where the residuals are `residuals` (m,) [m].
 
@@ -92,6 +92,7 @@ def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: 
     :param starts: each returns those with initial chains of other noise; may be empty.
     :param restarted: each simulates the trials with the initial chains of one of `starts`; may be empty.
     :param hands: each returns those with an error of the hands that is larger by its standard deviation.
+    :param slow: each returns those with one slow error of one standard deviation in every trial.
     :param fading: (d,) False for parameters whose effect is much the same along their scale; None: all may
         fade or have kinks.
     :param upper: (d,) upper ends of the box, or one for all; the lower ones are 0.
@@ -114,11 +115,12 @@ def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: 
         shift = np.ones(len(point)) if fine is None else optimum_shift(fit, fine)
     drawn = [residuals for start in starts for residuals in start()]
     count += len(drawn)
-    others = [residuals for hand in hands for residuals in hand()]
-    count += len(others)
+    others, slowly = ([residuals for each in pending for residuals in each()] for pending in (hands, slow))
+    count += len(others) + len(slowly)
     uncertainty = at_minimum(fit, layout, noise=noise, shift=shift,
                              starts=[residuals for residuals in drawn if residuals is not None],
-                             hands=[residuals for residuals in others if residuals is not None])
+                             hands=[residuals for residuals in others if residuals is not None],
+                             slow=[residuals for residuals in slowly if residuals is not None])
     uncertainty = extended(fit, uncertainty, residuals_at, fading)
     elsewhere = [(there, restart) for there, restart in zip(drawn, restarted, strict=False)
                  if there is not None and np.sqrt(np.mean((there - residuals)**2)) > uncertainty.residual]

@@ -5,7 +5,7 @@
 Uncertainty: the covariance and the intervals of the calibrated parameters, in units of a search.
 
 If the search ended in a regular minimum, the covariance follows from the Jacobian of the residuals there.
-The textbook's formula alone is several times too small for real DLOs.  Therefore it takes six more effects
+The textbook's formula alone is several times too small for real DLOs.  Therefore it takes seven more effects
 into account:
 
 - the errors of neighbouring points are correlated, so that these count as fewer;
@@ -15,6 +15,7 @@ into account:
   interval contains what the trials say without any one of them;
 - the step and the nodes of the simulation move the optimum;
 - trials that look alike share the error of the model, so that repeating one averages only its noise;
+- chains and hands may have errors that change slowly, as those of a film, where their size is given;
 - the reported point may be beside the minimum, after a search that does not converge (`Uncertainty.at`).
 
 After any other search, such as a random one, the spread of the best evaluations is used.
@@ -210,7 +211,7 @@ def noise_alone(residual: float, noise: float) -> bool:
 
 def at_minimum(fit: Linearisation, layout: ResidualLayout, *, noise: float = float('nan'),
                shift: Floats | None = None, starts: Sequence[Floats] | Floats = (),
-               hands: Sequence[Floats] = ()) -> Uncertainty:
+               hands: Sequence[Floats] = (), slow: Sequence[Floats] = ()) -> Uncertainty:
     """
     Return the uncertainty that follows from the linearised residuals at a minimum.
 
@@ -218,6 +219,7 @@ def at_minimum(fit: Linearisation, layout: ResidualLayout, *, noise: float = flo
     :param shift: (d,) how far a finer simulation moves the optimum; None: unknown.
     :param starts: residuals (m,) [m] at the minimum, for initial chains with other noise; may be empty.
     :param hands: those for errors of the hands that are larger by one standard deviation each.
+    :param slow: those for one slow error each, of one standard deviation in every trial; see `slow_errors`.
     """
     point, loss = fit.point, Huber.of(fit.residuals)
     clipped = loss.clipped(fit.residuals)
@@ -261,10 +263,13 @@ def at_minimum(fit: Linearisation, layout: ResidualLayout, *, noise: float = flo
         biased = step @ fit.jacobian.T @ bias / scale**2
         moves = moves + np.outer(biased, biased)
         covariance = covariance + np.where(np.outer(excited, excited), moves, 0.0)
-    for residuals in hands:
-        pull = fit.jacobian.T @ (loss.roots(fit.residuals)**2 * (residuals - fit.residuals)) / scale**2
-        move = np.linalg.solve(weighted.information + prior, pull)
-        covariance = covariance + np.where(np.outer(excited, excited), np.outer(move, move), 0.0)
+    whole: list[Rows] = [slice(None)]
+    each: list[Rows] = [*layout.rows]  # all trials share an error of the hands, but not a slow one
+    for residuals, parts in zip((*hands, *slow), [whole] * len(hands) + [each] * len(slow), strict=True):
+        change = loss.roots(fit.residuals)**2 * (residuals - fit.residuals) / scale**2
+        for rows in parts:
+            move = np.linalg.solve(weighted.information + prior, fit.jacobian[rows].T @ change[rows])
+            covariance = covariance + np.where(np.outer(excited, excited), np.outer(move, move), 0.0)
     covariance = covariance + np.where(np.outer(excited, excited), moved, 0.0)
     # No standard deviation is larger than that of the prior.
     shrink = np.minimum(1.0, UNKNOWN_STD / np.sqrt(np.diag(covariance)))

@@ -19,7 +19,7 @@ import numpy as np
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.action import Hand
 from dlo_calibration.model.chain import Chain, Floats
-from dlo_calibration.observation.grasps import Grasp, grasp_of, LIFTED
+from dlo_calibration.observation.grasps import Grasp, grasps_of, LIFTED
 from dlo_calibration.observation.sightings import (
     complete,
     HandSightings,
@@ -76,44 +76,45 @@ def episodes(seen: Sightings, hands: Sequence[HandSightings],
 
     :param count: of points of their chains; None: as many as were seen.
     """
-    motion = _motion(seen)
+    times, movements = seen.times, _movements(seen, _motion(seen))
+    rests = [pictures_between(times, max(times[before], times[first] - START), times[first] - SPAN)
+             for before, (first, _) in zip([0, *(last for _, last in movements)], movements, strict=False)]
+    starts = {k: start for k, rest in enumerate(rests)
+              if len(rest) and usable(start := _resting(seen.points[rest]))}
+    held: dict[int, list[Grasp]] = {k: [] for k in starts}
+    for hand in hands:
+        grasps = grasps_of(seen, hand, [(Chain(start), *movements[k]) for k, start in starts.items()])
+        for k, grasp in zip(starts, grasps, strict=True):
+            held[k] += [] if grasp is None else [grasp]
     cut: list[Episode] = []
     problems: list[str] = []
-    movements = _movements(seen, motion)
-    bounds = [0, *(last for _, last in movements), len(seen.times) - 1]
-    starts = [first for first, _ in movements[1:]] + [len(seen.times) - 1]
-    for before, (first, last), after in zip(bounds, movements, starts, strict=False):
-        span = f'{seen.times[first]:.1f} to {seen.times[last]:.1f} s'
+    for k, (first, last) in enumerate(movements):
+        after = movements[k + 1][0] if k + 1 < len(movements) else len(times) - 1
         try:
-            cut.append(_episode(seen, hands, motion, (before, first, last, after), count))
+            if k not in held:
+                raise InputError('movement', 'a DLO that moves or is hidden from the beginning',
+                                 f'a rest of {REST:g} s before it',
+                                 'begin to film earlier, or wait between two movements')
+            if not held[k]:
+                raise InputError('movement', 'no tag that moves with the DLO' if hands else
+                                 'no tag in the film', 'one on what moves it', 'glue a tag on what holds the '
+                                 'DLO where it is seen, or click the point that is held (--held)')
+            cut.append(_episode(seen, held[k], starts[k], float(times[rests[k][0]]), last, after, count))
         except InputError as error:
-            problems.append(f'{span}: {error}')
+            problems.append(f'{times[first]:.1f} to {times[last]:.1f} s: {error}')
     return tuple(cut), tuple(problems)
 
 
-def _episode(seen: Sightings, hands: Sequence[HandSightings], motion: Floats,
-             pictures: tuple[int, int, int, int], count: int | None) -> Episode:
+def _episode(seen: Sightings, grasps: Sequence[Grasp], start: Floats, since: float, last: int, after: int,
+             count: int | None) -> Episode:
     """
     Return the episode of one movement.
 
-    :param pictures: the last one of the movement before, the first and the last one of this movement, and
-        the first one of the next.
-    :raises InputError: where nothing shows what moved the DLO, or where it did not rest.
+    :param start: the DLO at rest before (m, 3) [m], from the time `since` on [s].
+    :param last: picture of this movement; `after`: the first one of the next.
+    :raises InputError: where the DLO did not rest, or is not seen.
     """
-    before, first, last, after = pictures
     times = seen.times
-    rest = pictures_between(times, max(times[before], times[first] - START), times[first] - SPAN)
-    rest = rest[rest >= before]
-    if not len(rest):
-        raise InputError('movement', 'a DLO that moves from the beginning', f'a rest of {REST:g} s before it',
-                         'begin to film earlier, or wait between two movements')
-    start = _resting(seen.points[rest])
-    initial = Chain(start)
-    grasps = [grasp for hand in hands if (grasp := grasp_of(seen, hand, initial, first, last)) is not None]
-    if not grasps:
-        raise InputError('movement', 'no tag that moves with the DLO' if hands else 'no tag in the film',
-                         'one on what moves it', 'glue a tag on what holds the DLO where it is seen, or '
-                         'click the point that is held (--held)')
     closes, opens = min(grasp.first for grasp in grasps), max(grasp.last for grasp in grasps)
     initial = Chain(_fewer(start, count))
     paths = [_path(seen, grasp, initial) for grasp in grasps]
@@ -134,7 +135,7 @@ def _episode(seen: Sightings, hands: Sequence[HandSightings], motion: Floats,
         raise InputError('movement', 'a DLO of which less than half is seen afterwards', 'the whole DLO',
                          'take the hand away after each movement')
     chains = [(time, _fewer(points, count)) for time, points in (*goals, *chains)]
-    return Episode(float(times[rest[0]]), chains[-1][0], initial, tuple(paths),
+    return Episode(since, chains[-1][0], initial, tuple(paths),
                    tuple(grasp.place for grasp in grasps), tuple(chains), len(goals))
 
 

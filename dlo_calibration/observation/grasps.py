@@ -11,6 +11,7 @@ of sight.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,13 +33,12 @@ PLACES = 201  # along the DLO at which a hand may hold it
 MOST, ROUNDS = 60, 4  # pictures in which they are compared, and weightings of these
 DOUBTED = 0.006  # m; a picture in which a place is farther from where it is in the hand hardly counts
 BRIDGED = 0.2  # share of the length to both sides of a place, in which the DLO must be seen
-LEAVING = 0.6  # s; a hand that leaves a DLO stood still so long before they are apart, at most
 PARTED = 5  # pictures in a row that show hand and DLO apart
-SLIPPED = 0.0015  # m, by which a held point moves beside its hand when that opens
 LEFT, SIGMAS = 0.005, 5.0  # m, and times what is typical: a grip farther from its hand is left
 HELD = 0.012  # m; from a hand to the point that it holds, at most, in half of the movement's pictures
 BESIDE = 0.005  # of a grip's distance from its tag that counts as error: of places alike, the nearest is held
 AT_REST = 0.0015  # m; nearer to where a hand closes, it stands there
+AGREES = 0.5  # of the difference between two such offsets of one hand: a tag is glued once, a hand tilts
 REACH = 0.25  # m from a tag to what the hand holds, at most
 LIFTED = 0.008  # m above the table
 
@@ -61,16 +61,34 @@ class Grasp:
     lifts: bool
 
 
-def grasp_of(seen: Sightings, hand: HandSightings, initial: Chain, first: int, last: int) -> Grasp | None:
-    """Return how a hand holds the DLO in a movement, from picture `first` to `last`; None: it does not."""
-    times = seen.times
-    still_turned = np.tile(NO_ROTATION, (len(times), 1))
+def grasps_of(seen: Sightings, hand: HandSightings, movements: Sequence[tuple[Chain, int, int]]
+              ) -> list[Grasp | None]:
+    """
+    Return how a hand holds the DLO in each movement; None: it does not.
+
+    A tag is glued to a hand once, so it is beside what is held in much the same way each time.
+
+    :param movements: the DLO at rest before, and the first and last picture of each.
+    """
     if hand.place is not None:
-        high = np.nanmax(hand.positions[first:last + 1, 2], initial=-np.inf) - seen.radius
-        return Grasp(hand.name, hand.place, hand.positions, still_turned, max(first - 1, 0), last,
-                     bool(high > LIFTED))
+        turns = np.tile(NO_ROTATION, (len(seen.times), 1))
+        lifted = [bool(np.nanmax(hand.positions[first:last + 1, 2], initial=-np.inf) - seen.radius > LIFTED)
+                  for _, first, last in movements]
+        return [Grasp(hand.name, hand.place, hand.positions, turns, max(first - 1, 0), last, lifts)
+                for (_, first, last), lifts in zip(movements, lifted, strict=True)]
+    speed = _speed(seen.times, hand.positions)
+    moved = [_moved_by(seen, hand, speed, *movement) for movement in movements]
+    held = [way for way in moved if way is not None]
+    chosen = dict(zip(map(id, held), _alike(held), strict=True))
+    return [None if way is None else way.grasp(seen, hand, speed, chosen[id(way)], last)
+            for way, (_, _, last) in zip(moved, movements, strict=True)]
+
+
+def _moved_by(seen: Sightings, hand: HandSightings, speed: Floats, initial: Chain, first: int,
+              last: int) -> _Motion | None:
+    """Return how the places of the DLO and a hand move together in a movement; None: they do not."""
+    times = seen.times
     known = np.isfinite(hand.positions[:, 0])
-    speed = _speed(times, hand.positions)
     near = pictures_between(times, times[first] - 3 * SPAN, times[first] + 5 * SPAN)
     near = near[known[near]]
     span = np.arange(first, last + 1)
@@ -80,51 +98,76 @@ def grasp_of(seen: Sightings, hand: HandSightings, initial: Chain, first: int, l
     # It has come to a standstill before it moves again, with the DLO.
     still = near[speed[near] < STILL]
     stands = np.split(still, np.flatnonzero(np.diff(still) > 1) + 1)[0]
-    closes = int(stands[-1]) if len(still) else int(near[speed[near].argmin()])
-    if np.linalg.norm(hand.positions[span] - hand.positions[closes], axis=1).max() < WAY:
+    closes = int(stands[-1]) if len(still) else max(first - 1, 0)
+    shown = closes if len(still) else int(span[0])
+    begin = hand.positions[shown]
+    if np.linalg.norm(hand.positions[span] - begin, axis=1).max() < WAY:
         return None
     there = near[near <= closes]
-    there = there[np.linalg.norm(hand.positions[there] - hand.positions[closes], axis=1) < AT_REST]
+    there = there[np.linalg.norm(hand.positions[there] - begin, axis=1) < AT_REST]
     compared = span[np.unique(np.linspace(0, len(span) - 1, min(len(span), MOST)).astype(int))]
-    turned = [still_turned] if hand.orientations is None else [
-        hand.orientations, _about_vertical(hand.orientations, closes)]
-    grip = min((_grip(seen, hand, rotations, initial, there, compared) for rotations in turned),
-               key=lambda grip: grip.cost)
-    if not grip.typical < HELD:
-        return None
-    own = _own(seen, grip.place)
-    apart = np.full(len(times), np.nan)
-    both = np.isfinite(own[:, 0]) & known
-    apart[both] = _apart(seen, grip.path[both], own[both], both)
-    way = np.linalg.norm(hand.positions - hand.positions[closes], axis=1)
-    opens = _opens(times, apart, min(max(LEFT, SIGMAS * grip.typical), HELD), speed, way, closes, last)
-    stands = closes + np.flatnonzero(
-        np.linalg.norm(grip.path[closes:opens + 1] - grip.path[opens], axis=1) < LEFT)
-    low = grip.path if seen.cameras is None else _dragged(seen, grip.path)
-    opens = _slips(low - own, closes, opens, stands)
-    held = slice(closes, opens + 1)
-    moving = grip.path[held][(speed[held] >= STILL) & known[held]]
-    lifts = seen.cameras is None or bool(
-        len(moving) and np.median(moving[:, 2]) - seen.radius > LIFTED)
-    path = grip.path if lifts else _like_the_dlo(times, low, own, held)
-    return Grasp(hand.name, grip.place, path, grip.turns, closes, opens, lifts)
+    turned = [np.tile(NO_ROTATION, (len(times), 1))] if hand.orientations is None else [
+        hand.orientations, _about_vertical(hand.orientations, shown)]
+    motion = min((_motion(seen, hand, rotations, initial, closes, there, compared) for rotations in turned),
+                 key=lambda motion: motion.costs.min())
+    return motion if motion.typical[motion.costs.argmin()] < HELD else None
+
+
+def _alike(motions: Sequence[_Motion]) -> list[int]:
+    """Return the index of the place that is held in each motion of one hand, whose tag is glued once."""
+    best = [int(motion.costs.argmin()) for motion in motions]
+    if len(motions) < 2:
+        return best
+    # Where the tag may be beside what is held: as one of the motions would have it.
+    tried = np.concatenate([motion.beside[motion.costs <= 2.0 * motion.costs.min()] for motion in motions])
+    costs = [np.square(motion.costs) + AGREES**2 * np.square(
+        np.linalg.norm(motion.beside - tried[:, None], axis=2)) for motion in motions]
+    together = int(sum(cost.min(axis=1) for cost in costs).argmin())
+    return [int(cost[together].argmin()) for cost in costs]
 
 
 @dataclass(frozen=True, eq=False)
 class _Motion:
     """
-    How a hand and a place of the DLO move together.
+    How a hand and p places of the DLO move together.
 
-    :param typical: median distance between the place and where it is in the hand [m]; pictures in which the
-        hand has opened do not count much in it, nor in `cost`, which counts the offset, too.
-    :param path: (n, 3) where the grip is, as the tag shows it [m], and `turns`, (n, 4); NaN where unknown.
+    :param closes: the picture in which the hand closes, and `turns`, (n, 4), its orientations.
+    :param offsets: (p, 3) of each place from the tag in the frame of the hand [m]; `beside`, (p, 2), over the
+        table, where the tag's x is level.
+    :param typical: (p,) median distance between a place and where it is in the hand [m]; pictures in which
+        the hand has opened do not count much in it, nor in `costs`, which count the offset, too.
     """
 
-    place: float
-    typical: float
-    cost: float
-    path: Floats
+    closes: int
     turns: Floats
+    offsets: Floats
+    beside: Floats
+    typical: Floats
+    costs: Floats
+
+    def grasp(self, seen: Sightings, hand: HandSightings, speed: Floats, place: int, last: int) -> Grasp:
+        """Return how the hand holds a place of the DLO, which does not move after the picture `last`."""
+        from scipy.spatial.transform import Rotation  # takes a quarter of a second to load
+
+        closes, share = self.closes, place / (PLACES - 1)
+        path = np.full((len(self.turns), 3), np.nan)
+        known = np.isfinite(self.turns[:, 0]) & np.isfinite(hand.positions[:, 0])
+        path[known] = hand.positions[known] + Rotation.from_quat(self.turns[known]).apply(self.offsets[place])
+        own = _own(seen, share)
+        apart = np.full(len(path), np.nan)
+        both = np.isfinite(own[:, 0]) & known
+        apart[both] = _apart(seen, path[both], own[both], both)
+        begin = hand.positions[closes:][known[closes:]][0]
+        stands = (speed < STILL) & (np.linalg.norm(hand.positions - begin, axis=1) > WAY)
+        most = min(max(LEFT, SIGMAS * float(self.typical[place])), HELD)
+        opens = _opens(seen.times, apart, most, stands, closes, last)
+        low = path if seen.cameras is None else _dragged(seen, path)
+        held = slice(closes, opens + 1)
+        moving = path[held][(speed[held] >= STILL) & known[held]]
+        lifts = seen.cameras is None or bool(
+            len(moving) and np.median(moving[:, 2]) - seen.radius > LIFTED)
+        return Grasp(hand.name, share, path if lifts else np.where(np.isfinite(low), low, own), self.turns,
+                     closes, opens, lifts)
 
 
 def _about_vertical(orientations: Floats, start: int) -> Floats:
@@ -145,10 +188,10 @@ def _about_vertical(orientations: Floats, start: int) -> Floats:
     return turned
 
 
-def _grip(seen: Sightings, hand: HandSightings, turns: Floats, initial: Chain, there: NDArray[np.intp],
-          compared: NDArray[np.intp]) -> _Motion:
+def _motion(seen: Sightings, hand: HandSightings, turns: Floats, initial: Chain, closes: int,
+            there: NDArray[np.intp], compared: NDArray[np.intp]) -> _Motion:
     """
-    Return the place of the DLO, and its offset from the tag, that move together best.
+    Return how places of the DLO, each with its offset from the tag, move together with it.
 
     :param turns: (n, 4) quaternions of the hand.
     :param there: pictures in which the hand is at the resting DLO; `compared`: those of the movement.
@@ -170,7 +213,8 @@ def _grip(seen: Sightings, hand: HandSightings, turns: Floats, initial: Chain, t
     tags = hand.positions[pictures, None]
     slopes = across @ rotations[:, None]  # (k, PLACES, 3, 3)
     values = (across @ (points - tags)[..., None])[..., 0]
-    offsets = np.einsum('kba,kpb->pa', rotations[:len(there)], resting - tags[:len(there)]) / len(there)
+    first = max(len(there), 1)
+    offsets = np.einsum('kba,kpb->pa', rotations[:first], points[:first] - tags[:first]) / first
     for _ in range(ROUNDS):
         apart = np.linalg.norm(np.einsum('kpab,pb->kpa', slopes, offsets) - values, axis=2)
         weights = 1.0 / np.square(1.0 + np.square(apart / DOUBTED))  # Geman and McClure's
@@ -182,11 +226,10 @@ def _grip(seen: Sightings, hand: HandSightings, turns: Floats, initial: Chain, t
     mean = np.sqrt(np.mean(np.square(apart) / (1.0 + np.square(apart / DOUBTED)), axis=0))
     reach = np.linalg.norm(offsets, axis=1)
     cost = np.where(reach > REACH, np.inf, np.hypot(mean, BESIDE * reach))
-    best = int(cost.argmin())
-    path = np.full((len(turns), 3), np.nan)
-    known = np.isfinite(turns[:, 0]) & np.isfinite(hand.positions[:, 0])
-    path[known] = hand.positions[known] + Rotation.from_quat(turns[known]).apply(offsets[best])
-    return _Motion(float(places[best]), float(np.median(apart[:, best])), float(cost[best]), path, turns)
+    rotation = rotations[0]
+    yaw = np.arctan2(rotation[1, 0] - rotation[0, 1], rotation[0, 0] + rotation[1, 1])
+    level = offsets @ rotation[:2].T @ np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+    return _Motion(closes, turns, offsets, level, np.median(apart, axis=0), cost)
 
 
 def _own(seen: Sightings, place: float) -> Floats:
@@ -216,80 +259,26 @@ def _dragged(seen: Sightings, path: Floats) -> Floats:
     return np.asarray(seen.cameras + share * (path - seen.cameras))
 
 
-def _like_the_dlo(times: Floats, path: Floats, own: Floats, held: slice) -> Floats:
-    """
-    Return the smooth path (n, 3) [m] of a grip on the table as the DLO itself shows it.
-
-    That is better than a tag beside it; where the DLO is lost, the tag shows how it moves on.  A hand does
-    not tremble as the noise of single pictures does, which would shake a simulated DLO.
-
-    :param path: as the tag shows it, and `own` as the DLO does; `held`: in which pictures the hand holds it.
-    """
-    moves = np.where(np.isfinite(path), path, 0.0)
-    both = held.start + np.flatnonzero(np.isfinite(own[held, 0]) & np.isfinite(path[held, 0]))
-    if not len(both):
-        return path
-    off = (own - moves)[both]
-    smooth = np.full_like(path, np.nan)
-    for k in np.flatnonzero(np.isfinite(path[:, 0])):
-        near = np.maximum(np.exp(-np.square((times[both] - times[k]) / SPAN) / 2.0), 1e-9)
-        smooth[k] = path[k] + near @ off / near.sum()
-    return np.asarray(np.where(np.isfinite(smooth), smooth, own))
-
-
-def _opens(times: Floats, apart: Floats, most: float, speed: Floats, way: Floats, closes: int,
+def _opens(times: Floats, apart: Floats, most: float, stands: NDArray[np.bool_], closes: int,
            last: int) -> int:
     """
-    Return the picture in which a hand opens: the last one before hand and DLO part.
+    Return the picture in which a hand opens.
 
-    A hand that moves away has stood still before.  While both stay together, it opens when it has come to a
-    standstill: nothing shows that it holds the DLO any longer.
+    A hand that comes to a standstill before the DLO rests may hold it longer, but nothing shows that, and
+    nothing moves.  A hand that does not opens before both part, or when the DLO rests.
 
     :param apart: (n,) how far both are apart [m]; NaN where this is unknown.
     :param most: how far they are apart while the hand holds the DLO [m].
-    :param way: (n,) of the hand from where it closed [m].
+    :param stands: (n,) whether the hand stands still, elsewhere than where it closed.
+    :param last: the last picture in which the DLO moves.
     """
-    end = int(np.searchsorted(times, times[last] + 1.0))
-    known = closes + np.flatnonzero(np.isfinite(apart[closes:end]))
-    together = known[apart[known] < most]
-    parts = [k for k in together if (apart[known[known > k][:PARTED]] >= most).all()]
-    parted = bool(parts) and bool((known > parts[0]).sum() >= PARTED)
-    held = parts[0] if parted else together[-1] if len(together) else closes
-    unseen = np.arange(held + 1, known[known > held][0] if (known > held).any() else end)
-    moves = closes + np.flatnonzero(speed[closes:end] >= STILL)
-    stood = unseen[(speed[unseen] < STILL) & (way[unseen] > WAY)]
-    if len(stood):  # they part while this is not seen, after the hand has come to a standstill
-        return int(np.split(stood, np.flatnonzero(np.diff(stood) > 1) + 1)[0][0])
-    if len(unseen) and times[unseen[-1]] - times[held] > LEAVING:
-        return int(np.clip(last, held, unseen[-1]))
-    if parted:
-        for before in together[together < held][::-1]:  # they begin to part
-            if not apart[held] > max(apart[before] + most / 4, most / 2):
-                break
-            held = before
-        stood = together[(speed[together] < STILL) & (times[together] > times[held] - LEAVING)
-                         & (together <= held)]
-        return int(stood[-1] if len(stood) else held)
-    moves = moves[moves <= held]
-    stands = min(int(moves[-1]) + 1 if len(moves) else held, held)
-    return int(max(stands, min(last, held)))
-
-
-def _slips(apart: Floats, closes: int, opens: int, stands: NDArray[np.intp]) -> int:
-    """
-    Return the picture in which a hand opens: the last one before the DLO begins to move without it.
-
-    :param apart: (n, 3) from the hand's grip to the place that it holds [m]; NaN where unknown.
-    :param stands: pictures in which the hand stands where it opens.
-    """
-    known = closes + np.flatnonzero(np.isfinite(apart[closes:opens + 1, 0]))
-    for k in range(PARTED, len(known)):
-        if known[k] not in stands:
-            continue
-        usual = np.median(apart[known[k - PARTED:k]], axis=0)
-        if (np.linalg.norm(apart[known[k:]] - usual, axis=1) > SLIPPED).all():
-            return int(known[k - 1])
-    return opens
+    end = int(np.searchsorted(times, times[last] + 2.0 * SPAN))
+    known = closes + np.flatnonzero(np.isfinite(apart[closes:]))
+    away = apart[known] >= most
+    parted = known[[k for k in range(len(known) - PARTED + 1) if away[k:k + PARTED].all()]]
+    end = min(end, *parted[:1])
+    begins = closes + 1 + np.flatnonzero(stands[closes + 1:end] & ~stands[closes:end - 1])
+    return int(begins[-1]) if len(begins) else max(min(last, end - 1), closes)
 
 
 def _apart(seen: Sightings, grips: Floats, points: Floats, pictures: NDArray[np.bool_]) -> Floats:

@@ -10,6 +10,7 @@ import sys
 from types import MappingProxyType
 from typing import Any, Callable, Iterable, Mapping, Sequence
 
+from dlo_calibration.capture.trials import FILM_ERRORS
 from dlo_calibration.errors import InputError, suggestion
 
 
@@ -96,7 +97,8 @@ def tracker_and_calibrator(file: str, parameters: Mapping[str, str] = MappingPro
                                 *flags({'points': value['points'], 'frame_id': value['frame']}, topics)]),
             Node(package='dlo_calibration', executable='calibrator', name='calibrator', output='screen',
                  ros_arguments=['--params-file', str(config / 'calibrator.yaml'), *flags(
-                     {name: value[name] for name in ('mass', *parameters)},
+                     {name: value[name] for name in ('mass', *parameters)} | {
+                         name: str(size) for name, size in FILM_ERRORS.items()},
                      {name: f'/tracker/{of}' for name, of in SEEN.items()})]),
             Node(package='rviz2', executable='rviz2', name='rviz2',
                  arguments=['-d', str(config / 'tracker.rviz'), '-f', LaunchConfiguration('frame')],

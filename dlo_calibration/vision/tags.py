@@ -29,6 +29,7 @@ QUIET = 0.003  # m
 
 NEAR = 2.5  # sides of a tag around where it was seen last, in which it is looked for first
 EVERYWHERE = 5  # pictures from one search of the whole picture to the next, while all tags are seen nearby
+SOUGHT = 15  # pictures after a tag was lost, in which the whole picture is searched
 CELL, EDGE = 6, 0.5  # px of a cell in the picture with which a tag is aligned, and blur of its edges
 ALIGNMENT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-5)
 ALIKE = 0.9  # correlation with its printed picture of a tag whose code is not read
@@ -58,6 +59,7 @@ class TagFinder:
         self._last: dict[int, Floats] = {}  # corners (4, 2) [px]
         self._steps: dict[int, Floats] = {}  # since the picture before, likewise
         self._count = 0
+        self._sought = 0  # until which picture
 
     def find(self, pixels: Pixels) -> dict[int, Floats]:
         """
@@ -74,7 +76,7 @@ class TagFinder:
             near = _found(np.ascontiguousarray(grey[top:bottom, left:right]))
             if number in near:
                 found[number] = near[number] + (left, top)
-        if self._count % EVERYWHERE == 0 or len(found) < len(self._last):
+        if self._count % EVERYWHERE == 0 or len(found) < len(self._last) or self._count < self._sought:
             found = {**_found(grey), **found}
         self._count += 1
         before, self._last = self._last, {}
@@ -89,6 +91,8 @@ class TagFinder:
                 if aligned is not None and alike > ALIKE:
                     self._steps[number] = aligned - corners
                     self._last[number] = aligned
+        if len(self._last) < len(before):
+            self._sought = self._count + SOUGHT
         return dict(self._last)
 
 

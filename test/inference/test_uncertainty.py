@@ -371,3 +371,13 @@ def test_an_error_of_the_hands_widens_the_intervals_as_far_as_it_moves_the_optim
     other = at_minimum(fit, LAYOUT, noise=1e-3, hands=[residuals + 0.05 * jacobian[:, 0]])
     assert other.std[0] == pytest.approx(np.hypot(alone.std[0], 0.05), rel=0.05)
     assert other.std[1] == pytest.approx(alone.std[1], rel=0.05)
+
+
+def test_slow_errors_are_others_in_each_trial():
+    residuals, jacobian = np.random.default_rng(12).normal(0, 1e-3, ROWS), linear_model()
+    fit = Linearisation(POINT, residuals, jacobian)
+    shared, slow = (at_minimum(fit, LAYOUT, noise=1e-3, **{name: [residuals + 0.05 * jacobian[:, 0]]})
+                    for name in ('hands', 'slow'))
+    alone = at_minimum(fit, LAYOUT, noise=1e-3)
+    # Errors of several trials partly cancel; those that all of them share do not.
+    assert alone.std[0] < slow.std[0] < 0.9 * shared.std[0]

@@ -33,7 +33,7 @@ def test_the_hand_and_the_held_point_are_found(place, way, turn):
     assert episode.places[0] == pytest.approx(place, abs=0.03 if turn else 0.05)
     path, = episode.hands
     assert CLOSES - 0.5 <= path.start <= CLOSES + 0.15
-    assert OPENS - 0.15 <= path.end <= OPENS + 0.5
+    assert OPENS - 0.1 <= path.end <= OPENS + 0.1
     truth = np.stack([np.interp(path.times, seen.times, axis) for axis in grip.T], axis=1)
     error = path.positions - truth
     # Along the DLO, the place of the grip is known to 5 % of the length.
@@ -78,6 +78,58 @@ def test_two_movements_make_two_episodes():
     assert [episode.hands[0].name for episode in cut][:1] == ['hand_1']
     assert cut[-1].hands[0].start == pytest.approx(7.0 + CLOSES, abs=0.5)
     assert all('7.0' in problem or '6.9' in problem or '7.1' in problem for problem in problems)
+
+
+def test_the_tag_is_where_it_was_when_the_hand_held_the_dlo_before():
+    # The second movement is the same for all points nearby: alone, it leaves the place open.
+    first = filmed_hand(0.3)
+    seen, hand, grip = filmed_hand(0.95, turn=0.0, way=(-0.08, 0.0), start=7.0, seed=1)
+    alone, = episodes(seen, [hand])[0]
+    assert abs(alone.places[0] - 0.95) > 0.015
+    moved = np.nanmedian(first[0].points[-20:], axis=0) - np.nanmedian(seen.points[:20], axis=0)
+    second = (replace(seen, points=seen.points + moved),
+              replace(hand, positions=hand.positions + moved[round(0.95 * (COUNT - 1))]), grip)
+    cut, _ = episodes(*[part if k == 0 else [part] for k, part in enumerate(joined(first, second))])
+    assert [episode.places[0] for episode in cut] == [
+        pytest.approx(0.3, abs=0.006), pytest.approx(0.95, abs=0.011)]
+
+
+def shown(seen, hand, rows, points=None):
+    """Return sightings of the pictures `rows` one after the other, and other points if given."""
+    return (Sightings(np.arange(len(rows)) / 30.0, seen.points[rows] if points is None else points,
+                      seen.cameras[rows], RADIUS),
+            replace(hand, positions=hand.positions[rows], orientations=hand.orientations[rows]))
+
+
+def test_a_hand_that_pauses_on_its_way_holds_the_dlo():
+    seen, hand, _ = filmed_hand()
+    halfway = int(np.searchsorted(seen.times, (CLOSES + OPENS) / 2))
+    seen, hand = shown(seen, hand, np.r_[:halfway, [halfway] * 12, halfway:len(seen.times)])
+    (episode,), problems = episodes(seen, [hand])
+    assert not problems
+    assert episode.hands[0].end == pytest.approx(OPENS + 12 / 30, abs=0.1)
+
+
+def test_a_hand_whose_tag_is_not_seen_as_it_closes_has_closed_when_the_dlo_begins_to_move():
+    seen, hand, grip = filmed_hand()
+    hidden = (seen.times > CLOSES - 0.5) & (seen.times < CLOSES + 0.4)
+    positions = np.where(hidden[:, None], np.nan, hand.positions)
+    (episode,), problems = episodes(seen, [replace(hand, positions=positions)])
+    assert not problems
+    path, = episode.hands
+    assert path.start == pytest.approx(CLOSES, abs=0.2)
+    truth = np.stack([np.interp(path.times, seen.times, axis) for axis in grip.T], axis=1)
+    assert np.linalg.norm(path.positions - truth, axis=1).max() < 0.01
+
+
+def test_a_hand_that_goes_on_without_the_dlo_has_opened():
+    seen, hand, _ = filmed_hand()
+    drops = int(np.searchsorted(seen.times, (CLOSES + OPENS) / 2))
+    rows = np.arange(len(seen.times))
+    seen, hand = shown(seen, hand, rows, seen.points[np.minimum(rows, drops)])
+    (episode,), problems = episodes(seen, [hand])
+    assert not problems
+    assert episode.hands[0].end == pytest.approx(seen.times[drops], abs=0.15)
 
 
 def test_two_hands_share_an_episode():

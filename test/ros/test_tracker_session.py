@@ -180,9 +180,8 @@ def test_points_of_another_form_are_refused(text):
 
 
 @pytest.mark.long
-@pytest.mark.xfail(reason='the hand is said to open 0.6 s too early, as it stands still')
 def test_a_hand_with_a_tag_gives_an_action_and_where_the_dlo_was_before(graph):
-    camera = film_camera((960, 720))
+    camera = film_camera((1280, 720))  # with fewer pixels, the board's markers are too small
     film = filmed_trials((Move(12, (0.06, 0.18)),), rate=15.0)
     node = graph(points=' '.join(f'{u:.0f},{v:.0f}' for u, v in clicks(film, camera)))
     node.session.status_period = 0.0
@@ -195,9 +194,9 @@ def test_a_hand_with_a_tag_gives_an_action_and_where_the_dlo_was_before(graph):
     initial, = node.heard['initial_chain']
     (closes, opens, _), = film.holds
     start = action.header.stamp.sec - 1_700_000_000 + action.header.stamp.nanosec / 1e9
-    assert abs(start - closes) < 0.3
+    assert abs(start - closes) < 0.15
     assert abs(start + action.points[-1].time_from_start.sec
-               + action.points[-1].time_from_start.nanosec / 1e9 - opens) < 0.4
+               + action.points[-1].time_from_start.nanosec / 1e9 - opens) < 0.15
     assert list(action.joint_names) == ['hand_1']
     assert initial.header.stamp.sec + initial.header.stamp.nanosec / 1e9 < (
         action.header.stamp.sec + action.header.stamp.nanosec / 1e9)
