@@ -374,7 +374,7 @@ def combination(names: Sequence[str], vector: Floats) -> str:
 def trial_errors(trials: Sequence[Trial], evaluation: Evaluation) -> tuple[Floats, ...]:
     """Return the point errors [m] of each trial, from an evaluation of every goal."""
     assert evaluation.residuals is not None
-    return tuple(distances(evaluation.residuals[rows]) for rows in ResidualLayout.of(trials).rows)
+    return tuple(distances(evaluation.residuals[rows]) for rows in ResidualLayout.of(trials).point_rows)
 
 
 def simulated_chains(trials: Sequence[Trial], evaluation: Evaluation) -> tuple[Floats, ...]:

@@ -20,7 +20,7 @@ from typing import Any, Callable, Iterable, Mapping
 
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.record import decode, Record
-from dlo_calibration.messages.codec import INITIAL, INPUT_TYPES, NANOSECONDS, OUTPUT_TYPES
+from dlo_calibration.messages.codec import INITIAL, INPUT_TYPES, NANOSECONDS, OUTPUT_TYPES, WRENCH
 
 USED_TYPES: Mapping[str, str] = {**INPUT_TYPES, **OUTPUT_TYPES}
 
@@ -185,6 +185,8 @@ def _discarded(records: list[Record], discards: Iterable[tuple[int, int]]) -> se
     """
     stamped = []
     for k, record in enumerate(records):
+        if record.name == WRENCH:  # they may show the hand before the next trial
+            continue
         with suppress(InputError):  # decoding again reports it later
             stamp = decode(record).header.stamp
             stamped.append((stamp.sec * NANOSECONDS + stamp.nanosec, record.name != INITIAL, k))

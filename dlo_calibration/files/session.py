@@ -22,7 +22,16 @@ from dlo_calibration.calibration.options import file_options, FileOptions, Optio
 from dlo_calibration.errors import DEFECT, InputError, one_of, safe_line, suggestion
 from dlo_calibration.files.bag_reader import read_bag
 from dlo_calibration.files.record import decode, encode, Record
-from dlo_calibration.messages.codec import bag_types, built, GOAL, INPUT_TYPES, Key, Message, read, repeats
+from dlo_calibration.messages.codec import (
+    bag_types,
+    built,
+    GOAL,
+    INPUT_TYPES,
+    InputMessage,
+    Key,
+    read,
+    repeats,
+)
 from dlo_calibration.messages.collector import StampOrder, TrialCollector, went_back
 from dlo_calibration.messages.encoder import trial_messages
 from dlo_calibration.messages.refusals import counted
@@ -101,7 +110,7 @@ def trial_records(trials: Iterable[Trial], frame_id: str = 'world') -> tuple[Rec
     return message_records(trial_messages(tuple(trials), frame_id))
 
 
-def message_records(messages: Iterable[Message]) -> tuple[Record, ...]:
+def message_records(messages: Iterable[InputMessage]) -> tuple[Record, ...]:
     """Return the records of a session with the given messages."""
     types, records = bag_types(), []
     for message in messages:
@@ -126,7 +135,7 @@ def session_trials(session: Session, options: Options, note: Callable[[str], obj
         trials += collector.trials
         early += collector.take_early()
         refusals += [text for _, text in refused]
-        refusals += map(str, (*collector.refusals, *collector.loose_end))
+        refusals += map(str, (*collector.refusals, *collector.loose_end, *collector.force_problems))
     for text in counted(early):
         note(text)
     named = (replace(trial, name=f'trial {k}') for k, trial in enumerate(trials, start=1))
@@ -167,10 +176,10 @@ def session_manipulations(session: Session,
     return tuple(named), counted(refusals)
 
 
-def _by_clock(session: Session) -> tuple[list[list[Message]], list[str]]:
+def _by_clock(session: Session) -> tuple[list[list[InputMessage]], list[str]]:
     """Return the messages before and after each jump of the clock, and why others are not used."""
     order, refusals = StampOrder(), []
-    clocks: list[list[Message]] = [[]]
+    clocks: list[list[InputMessage]] = [[]]
     for record in session.inputs:
         try:
             content = read(record.name, decode(record))
@@ -188,7 +197,7 @@ def _by_clock(session: Session) -> tuple[list[list[Message]], list[str]]:
             clocks.append([])
         order.add(content)
         clocks[-1].append(content)
-    earlier: dict[Key, Message] = {}
+    earlier: dict[Key, InputMessage] = {}
     for k, messages in enumerate(clocks):
         fresh = [message for message in messages
                  if message.key not in earlier or not repeats(message, earlier[message.key])]
@@ -200,7 +209,7 @@ def _by_clock(session: Session) -> tuple[list[list[Message]], list[str]]:
     return clocks, refusals
 
 
-def _collected(messages: Iterable[Message],
+def _collected(messages: Iterable[InputMessage],
                options: Options) -> tuple[TrialCollector, list[tuple[str, str]]]:
     """Collect the messages of one clock; also return the kind of each refused message, and why."""
     collector = TrialCollector(options)

@@ -138,6 +138,23 @@ def residuals(trial: Trial, chains: Floats) -> Floats:
     return differences(trial, chains)[seen_points(trial)].ravel()
 
 
+def force_residuals(trial: Trial, forces: Floats) -> Floats:
+    """
+    Return simulated minus measured forces, (3 f,) [N], in the order of `Trial.forces`.
+
+    Those of a sensor with an unknown offset have no mean over the trial.
+
+    :param forces: (f, 3) [N] simulated.
+    """
+    if not trial.forces:
+        return np.zeros(0)
+    off = forces - np.stack([force.vector for _, _, force in trial.forces])
+    for name in {hand.name for _, hand, force in trial.forces if not force.tared}:
+        rows = [k for k, (_, hand, _) in enumerate(trial.forces) if hand.name == name]
+        off[rows] -= off[rows].mean(axis=0)
+    return np.asarray(off.ravel())
+
+
 def distances(residual: Floats) -> Floats:
     """Return the distances of simulated from observed points, (p,) [m], of a residual vector, (3 p,) [m]."""
     return np.asarray(np.linalg.norm(residual.reshape(-1, 3), axis=1))
