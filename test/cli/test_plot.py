@@ -72,6 +72,7 @@ def test_result_is_drawn_too(run, session, result, tmp_path):
     assert simulated(measured) == 0 < simulated(both)
 
 
+@pytest.mark.long
 def test_animation_is_a_gif_per_trial(run, session, result, tmp_path, monkeypatch):
     monkeypatch.setattr('dlo_calibration.simulation.motion.FRAME_RATE', 2)
     monkeypatch.setattr('dlo_calibration.report.animation.FRAME_RATE', 2)

@@ -103,7 +103,8 @@ def request(path):
     return path
 
 
-@pytest.mark.parametrize('source', ['session', 'own', 'request'])
+@pytest.mark.parametrize('source', [
+    'session', *(pytest.param(name, marks=pytest.mark.long) for name in ('own', 'request'))])
 def test_an_interrupted_fit_goes_on_with_the_same_trials(source, session, own, tmp_path, act):
     path, selected = {'session': (session, ()), 'own': (own, REMAP),
                       'request': (request(tmp_path / 'request.xml'), ())}[source]

@@ -321,6 +321,7 @@ def test_obstacles_are_shown_with_the_trials(start, tmp_path):
     assert {'scene/obstacles', 'trial_1/goal'} <= names
 
 
+@pytest.mark.long
 def test_trials_around_a_peg_are_fitted_with_the_scene_that_the_node_is_given(start, tmp_path):
     """The DLO was dragged around a peg: without it, no parameters lead there."""
     peg = ('<robot name="peg"><link name="table"><collision><origin xyz="0.4 0.05 0.05"/><geometry>'

@@ -4,7 +4,7 @@
 /** Step 5: the information of the trials, the calibration, its result, and the film. */
 
 import {h} from './dom.js';
-import {Film} from './film.js';
+import {Animation} from './animation.js';
 import {button, files, numeric, problem, warnings} from './parts.js';
 import {resultPanel} from './result.js';
 import {counted, duration, isComponent, number, words} from './words.js';
@@ -27,7 +27,7 @@ export class CalibrationStep {
 
   constructor(app) {
     this.app = app;
-    this.film = new Film(app);
+    this.animation = new Animation(app);
     app.project.addEventListener('change', () => this.#announce());
   }
 
@@ -274,11 +274,11 @@ export class CalibrationStep {
   }
 
   drawn() {
-    return this.film.drawn();
+    return this.animation.drawn();
   }
 
   player() {
-    return this.film.player();
+    return this.animation.player();
   }
 }
 
