@@ -85,7 +85,8 @@ def calibrate(trials: Sequence[Trial], options: Options | None = None, *,
         memory = Memory(log, engine_digest(options) if log is not None else '', on_notice)
         setting = Setting(tuple(trials), options, simulator, executor, should_stop, on_evaluation, memory)
         stack.callback(setting.pool.stop)
-        setting, result = fitted(setting)
+        result = fitted(setting)
+        setting = setting.weighing_forces(result.trials[0].force_scale)
         result = with_outlier(setting, result)
         confirm = stack.enter_context(confirming(
             result, second, should_stop, memory, obstacles=bool(options.scene)))
@@ -100,18 +101,17 @@ def calibrate(trials: Sequence[Trial], options: Options | None = None, *,
                              *filter(None, [result.outlier_words]), *result.warnings, *counted))
 
 
-def fitted(setting: Setting) -> tuple[Setting, CalibrationResult]:
+def fitted(setting: Setting) -> CalibrationResult:
     """
     Search, and examine the best parameter set: the stages that every result needs.
 
-    :returns: also the setting in which forces have their weights.
     :raises SimulationError: if no evaluation could be simulated.
     """
     prior = Prior.of(setting.trials, setting.options, setting.evidence)
     setting, best_fit = weighed(setting, searched(setting, prior))
     best_fit = examined(setting, best_fit)
     best_fit = replace(best_fit, best=setting.judged(best_fit.space, best_fit.best))
-    return setting, CalibrationResult.of(setting, prior, best_fit)
+    return CalibrationResult.of(setting, prior, best_fit)
 
 
 def searched(setting: Setting, prior: Prior) -> Fit:

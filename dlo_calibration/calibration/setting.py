@@ -61,6 +61,8 @@ class Setting:
 
     def weighing_forces(self, scale: float) -> Setting:
         """Return the same setting, in whose trials forces count by another scale, see `Trial` [m/N]."""
+        if scale == self.trials[0].force_scale:
+            return self
         other = copy.copy(self)
         object.__setattr__(other, 'trials', tuple(replace(trial, force_scale=scale) for trial in self.trials))
         other.__dict__.pop('_evaluator', None)

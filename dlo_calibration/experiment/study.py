@@ -240,7 +240,7 @@ def perform(task: Task, make_simulator: SimulatorFactory,
     options, trials, begun = task.options, task.trials, time.monotonic()
     with closing(make_simulator(options)) as simulator:
         try:
-            _, result = fitted(Setting(trials, options, simulator, should_stop=should_stop))
+            result = fitted(Setting(trials, options, simulator, should_stop=should_stop))
         except SimulationError as error:
             if should_stop():
                 raise CancelledError from error

@@ -31,6 +31,8 @@ from dlo_calibration.messages.codec import (
     Key,
     read,
     repeats,
+    TRIAL_TYPES,
+    WRENCH,
 )
 from dlo_calibration.messages.collector import StampOrder, TrialCollector, went_back
 from dlo_calibration.messages.encoder import trial_messages
@@ -51,7 +53,7 @@ class Session:
     :param warnings: those of the options, and one text for each defect that did not prevent reading.
     :param counts: number of recorded messages by topic, also of those that other programs use.
     :param duration: time from the first to the last of these [s].
-    :param frames: the frame_ids of `inputs`, sorted.
+    :param frames: the frame_ids of chains and actions in `inputs`, sorted.
     :param others: topics that are neither inputs nor outputs of the calibrator, and their types.
     """
 
@@ -248,11 +250,11 @@ def read_session(path: str | Path, namespace: str | None = None, remap: Mapping[
     try:
         topics = _input_topics(path, seen, namespace, remap, warnings)
     except InputError as error:
-        if not any_topics or not seen or any(INPUT_TYPES.get(topic.rsplit('/', 1)[-1]) == kind
+        if not any_topics or not seen or any(TRIAL_TYPES.get(topic.rsplit('/', 1)[-1]) == kind
                                              for topic, kind in seen):
             raise
         topics = frozenset()
-        warnings.append(f'no topic is one of {", ".join(INPUT_TYPES)}; {error.remedy}')
+        warnings.append(f'no topic is one of {", ".join(TRIAL_TYPES)}; {error.remedy}')
     inputs = [record for record in records
               if record.topic in topics and record.type == INPUT_TYPES[record.name]]
     usable, frames = _checked(bag.used(inputs), warnings)
@@ -276,13 +278,14 @@ def _checked(records: Iterable[Record],
     more: Counter[str] = Counter()
     for record in records:
         try:
-            frame = decode(record).header.frame_id
+            header = decode(record).header
         except InputError as error:
             more[record.topic] += record.topic in bad
             bad.setdefault(record.topic, error)
             continue
         good.append(record)
-        frames.add(frame)
+        if record.name != WRENCH:  # which names a hand
+            frames.add(header.frame_id)
     warnings += [f'{error}; and {more[topic]} more of {topic}' if more[topic] else str(error)
                  for topic, error in bad.items()]
     return tuple(good), tuple(sorted(frames))
@@ -311,16 +314,18 @@ def _input_topics(path: Path, seen: Iterable[tuple[str, str]], namespace: str | 
             warnings.append(f'topic {record.topic} is left out, as another one is read as {record.name}')
             continue
         if record.type == INPUT_TYPES.get(record.name):
-            if namespace is None or record.namespace.strip('/') == namespace.strip('/'):
+            if record.name == WRENCH or namespace is None or \
+                    record.namespace.strip('/') == namespace.strip('/'):
                 candidates[record.name].append(record)
         elif record.name in INPUT_TYPES:
             warnings.append(f'topic {record.topic} is left out: it is a {record.type}, '
                             f'not a {INPUT_TYPES[record.name]}')
+    forces = candidates.pop(WRENCH, [])  # each names its hand, so that any number of them can be read
     if not (remap or any(candidates.values())):
         held = ', '.join(sorted(f'{topic} ({kind})' for topic, kind in seen)) or 'no messages'
         raise InputError(
             f'session {path}', f'{held} ({warnings[-1]})' if warnings else held,
-            'at least one of ' + ', '.join(f'{kind} ({text})' for kind, text in INPUT_TYPES.items())
+            'at least one of ' + ', '.join(f'{kind} ({text})' for kind, text in TRIAL_TYPES.items())
             + ('' if namespace is None else f' in namespace {namespace}'),
             'record these topics, or name others with --remap TOPIC:=goal_chain' if namespace is None else
             'correct the namespace')
@@ -335,7 +340,8 @@ def _input_topics(path: Path, seen: Iterable[tuple[str, str]], namespace: str | 
         warnings.append(f'topics outside the namespace {complete[0]} are left out')
         candidates = {kind: [r for r in choice if r.namespace == complete[0].rstrip('/')]
                       for kind, choice in candidates.items()}
-    return frozenset([*remap, *(record.topic for choice in candidates.values() for record in choice)])
+    chosen = (*forces, *(record for choice in candidates.values() for record in choice))
+    return frozenset([*remap, *(record.topic for record in chosen)])
 
 
 def samples() -> Path:

@@ -19,12 +19,13 @@ from dlo_calibration.model.chain import Chain, check_ends, Floats, frozen_array,
 from dlo_calibration.model.trial import LARGEST_FORCE
 
 INITIAL, ACTION, GOAL, WRENCH = 'initial_chain', 'action', 'goal_chain', 'wrench'
-INPUT_TYPES: Mapping[str, str] = {
+#: What every trial needs.
+TRIAL_TYPES: Mapping[str, str] = {
     INITIAL: 'sensor_msgs/msg/PointCloud2',
     ACTION: 'trajectory_msgs/msg/MultiDOFJointTrajectory',
     GOAL: 'sensor_msgs/msg/PointCloud2',
-    WRENCH: 'geometry_msgs/msg/WrenchStamped',
 }
+INPUT_TYPES: Mapping[str, str] = {**TRIAL_TYPES, WRENCH: 'geometry_msgs/msg/WrenchStamped'}
 #: What the node sends, name -> type; recorded with its inputs.
 OUTPUT_TYPES: Mapping[str, str] = {
     'progress': 'diagnostic_msgs/msg/DiagnosticArray',

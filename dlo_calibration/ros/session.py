@@ -462,7 +462,7 @@ class CalibrationSession(NodeSession[CalibratorOptions]):
         self._graph.hear_waiting()  # messages sent before the request belong to this calibration
         options = self._take_options()
         reported = set(self._state.refusals)
-        for refusal in map(str, self._collector.refusals):
+        for refusal in map(str, (*self._collector.refusals, *self._collector.force_problems)):
             if refusal not in reported:
                 self.refuse(refusal)
         trials = self._collector.trials

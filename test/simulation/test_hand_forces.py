@@ -67,12 +67,11 @@ def test_while_a_rope_swings_its_hand_bears_what_accelerates_it(simulator):
     times = np.linspace(1.5, 2.5, 41)
     trial = held(HANGING, ((0,), (0.15, 0, 0)), at=times.tolist())
     rollout = simulator.simulate(trial, {**ROPE, 'damping': 0.0})
-    middle = np.trapezoid(rollout.chains, ALONG, axis=1) / LENGTH if hasattr(np, 'trapezoid') else \
-        np.trapz(rollout.chains, ALONG, axis=1) / LENGTH
+    middle = (rollout.chains[:, 1:] + rollout.chains[:, :-1]).mean(axis=1) / 2
     step = times[1] - times[0]
     acceleration = (middle[2:] - 2 * middle[1:-1] + middle[:-2]) / step**2
     off = rollout.forces[1:-1] - DOWN + MASS * acceleration
-    assert np.abs(off).max() < 0.1 * np.abs(MASS * acceleration).max()
+    assert np.linalg.norm(off) < 0.1 * np.linalg.norm(MASS * acceleration)
 
 
 @pytest.mark.parametrize('force', [np.array([0, np.nan, 0]), np.zeros(2), np.array([0, 0, 1e9])])
