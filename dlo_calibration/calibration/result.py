@@ -201,6 +201,16 @@ class CalibrationResult:
         return noise(self.trials) if self.examination is None else self.examination.noise
 
     @cached_property
+    def force_error(self) -> float:
+        """Root mean square of how far a component of a simulated force is off [N]; nan: none was measured."""
+        residuals = self.best.residuals
+        rows = zip(self.trials, ResidualLayout.of(self.trials).force_rows, strict=True)
+        if residuals is None or not any(trial.forces for trial in self.trials):
+            return float('nan')
+        off = np.concatenate([residuals[row] / trial.force_scale for trial, row in rows])
+        return float(np.sqrt(np.mean(off**2)))
+
+    @cached_property
     def parameters(self) -> Mapping[str, ParameterEstimate]:
         """The calibrated parameters; none of an unusable result is identifiable."""
         if not self.unusable:
@@ -425,6 +435,7 @@ def plain(result: CalibrationResult) -> dict[str, Any]:
         'default_error_m': examination and examination.default_error,
         'noise_m': examination and examination.noise,
         'residual_std_m': examination and examination.uncertainty.residual,
+        'force_error_n': result.force_error,
         'correlations': result.correlations,
         'advice': advice and {**asdict(advice), **{key: getattr(advice, key) * SCALE for key in (
             'std', 'expected_std', 'lower', 'upper')}},

@@ -40,7 +40,8 @@ def felt_trials(seed, rope=ROPE, lifts=LIFTS, offset=None, noise=NOISE, force_no
 def _felt(fine, name, points, lift, rope, dice, offset, noise, force_noise):
     ways = np.array([0, 0.5, 0.5, 1, 1])  # share of the way at each waypoint
     hands = tuple(Hand(f'hand_{k}', grips, (0.0, 1.0, 2.5, 3.5, 5.0),
-                       points[grips[0]] + ways[:, None] * np.array(way)) for k, (grips, way) in enumerate(lift))
+                       points[grips[0]] + ways[:, None] * np.array(way))
+                  for k, (grips, way) in enumerate(lift, start=1))
     names = tuple(hand.name for hand in hands)
     wanted = tuple(Force(hand, np.zeros(3), offset is None) for hand in names)
     goals = tuple(Goal(Chain(points), time, stable, names, forces=wanted)
