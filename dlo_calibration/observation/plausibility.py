@@ -122,7 +122,7 @@ def _upwards(trial: Trial, table_height: float | None, scene: bool) -> tuple[str
     if scene or not up or np.mean(up) < FELT:
         return ()
     return str(InputError(
-        trial.name, f'forces that push the hands up by {measured(float(np.mean(up)), "N")} on average, though '
+        trial.name, f'forces that push the hands up by {measured(float(np.mean(up)), "N")}, though '
         'a DLO hangs from them', 'the force that the DLO exerts on a hand, which points down there',
         'reverse the sign of the forces, or tell how the hands are turned')),
 

@@ -90,8 +90,8 @@ def _forces(result: CalibrationResult) -> list[str]:
              f'{measured(result.force_error, "N")} from the simulated ones in each component')
     untared = sum(not force.tared for force in forces)
     if untared:
-        words += (f'; the offset of {"their" if untared == len(forces) else "some"} sensors is unknown, so that '
-                  'only differences within a trial count')
+        words += (f'; the offset of {"their" if untared == len(forces) else "some"} sensors is unknown, so '
+                  'that only differences within a trial count')
     mass = result.parameters.get('mass')
     if mass is None:
         return [f'{words}.']

@@ -25,6 +25,7 @@ def main():
     while not all(publisher.get_subscription_count() for publisher in publishers.values()):
         assert time.monotonic() < until, 'nobody listens'
         rclpy.spin_once(node, timeout_sec=0.05)
+    time.sleep(1.0)  # the other side of a match may not know of it yet
     for record in records:
         publishers[record.name].publish(bytes(record.data))
     print('sent', flush=True)
