@@ -162,6 +162,7 @@ def test_a_result_is_not_usable_on_trials_of_another_dlo(tmp_path):
         stiff, trials, options).unusable)
 
 
+@pytest.mark.long
 def test_a_result_with_given_errors_of_the_hands_keeps_them(tmp_path):
     given = fit((*PHYSICS,), late=-0.08, hand_delay=-0.08)
     write_result(tmp_path / 'fixed.xml', given)

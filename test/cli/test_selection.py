@@ -67,6 +67,7 @@ def numbers(act, *words):
     return [(trial['number'], trial['name']) for trial in printed['trials']]
 
 
+@pytest.mark.long
 def test_every_verb_leaves_trials_out_and_keeps_the_numbers_of_the_others(session, tmp_path, act):
     assert numbers(act, session, '--without', '2') == [(1, 'trial 1'), (3, 'trial 3')]
     assert numbers(act, session, '--without', '3,2') == numbers(

@@ -451,6 +451,7 @@ def with_peg(document):
         {'photograph': photograph, 'kind': 'peg', 'first': [200, 250], 'second': [205, 250], 'height': 0.002}]
 
 
+@pytest.mark.long
 def test_obstacles_on_the_photograph_are_the_scene_of_the_calibration(tmp_path, command):
     folder = tmp_path / 'project'
     with served(folder, '--evaluations', 4, '--calibrate', 'flexibility', 'friction') as page:

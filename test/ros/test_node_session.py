@@ -157,7 +157,8 @@ def foreign_frame():
 
 @pytest.mark.parametrize(('octets', 'words'), [
     (bad_cloud, ('stamp of zero', 'header.stamp')), (foreign_frame, ('camera', 'world')),
-    (lambda: b'\0\1\0\0broken', ('do not decode', 'sensor_msgs/msg/PointCloud2')),
+    pytest.param(lambda: b'\0\1\0\0broken', ('do not decode', 'sensor_msgs/msg/PointCloud2'),
+                 marks=pytest.mark.long),
 ], ids=['stamp of zero', 'another frame', 'damaged bytes'])
 def test_a_refusal_is_reported_once_and_the_trials_stay(start, octets, words):
     graph = start()
