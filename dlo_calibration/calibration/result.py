@@ -201,14 +201,14 @@ class CalibrationResult:
         return noise(self.trials) if self.examination is None else self.examination.noise
 
     @cached_property
-    def force_error(self) -> float:
-        """Root mean square of how far a component of a simulated force is off [N]; nan: none was measured."""
+    def force_error(self) -> Floats:
+        """Root mean square of how far simulated forces are off in x, y and z, (3,) [N]; nan: not measured."""
         residuals = self.best.residuals
         rows = zip(self.trials, ResidualLayout.of(self.trials).force_rows, strict=True)
         if residuals is None or not any(trial.forces for trial in self.trials):
-            return float('nan')
-        off = np.concatenate([residuals[row] / trial.force_scale for trial, row in rows])
-        return float(np.sqrt(np.mean(off**2)))
+            return np.full(3, np.nan)
+        off = np.concatenate([residuals[row].reshape(-1, 3) / trial.force_scale for trial, row in rows])
+        return np.asarray(np.sqrt(np.mean(off**2, axis=0)))
 
     @cached_property
     def parameters(self) -> Mapping[str, ParameterEstimate]:
@@ -435,7 +435,7 @@ def plain(result: CalibrationResult) -> dict[str, Any]:
         'default_error_m': examination and examination.default_error,
         'noise_m': examination and examination.noise,
         'residual_std_m': examination and examination.uncertainty.residual,
-        'force_error_n': result.force_error,
+        'force_error_n': result.force_error.tolist(),
         'correlations': result.correlations,
         'advice': advice and {**asdict(advice), **{key: getattr(advice, key) * SCALE for key in (
             'std', 'expected_std', 'lower', 'upper')}},

@@ -59,7 +59,7 @@ class Setting:
         object.__setattr__(self, 'options', self.choice.options)
         object.__setattr__(self, 'trials', with_shared_places(trials))
 
-    def weighing_forces(self, scale: float) -> Setting:
+    def weighing_forces(self, scale: tuple[float, float, float]) -> Setting:
         """Return the same setting, in whose trials forces count by another scale, see `Trial` [m/N]."""
         if scale == self.trials[0].force_scale:
             return self

@@ -134,7 +134,7 @@ class Evaluator:
                             if not all(rollout.settled)))
         each = [residuals(trial, rollout.chains)
                 for trial, rollout in zip(self.trials, rollouts, strict=True)]
-        forces = [trial.force_scale * force_residuals(trial, rollout.forces)
+        forces = [force_residuals(trial, rollout.forces)
                   for trial, rollout in zip(self.trials, rollouts, strict=True)]
         residual = np.concatenate([part for both in zip(each, forces, strict=True) for part in both])
         compared = residual if self._rows is None else residual[self._rows]

@@ -87,8 +87,8 @@ class Trial:
     :param places: (n,) [m] arc lengths of the points at rest, from 0; None: those of the initial chain.
     :param session: number of the session, from 1; sessions may have parameters of their own.
     :param loads: whether a simulation shall measure the loads of the DLO on its way, which takes time.
-    :param force_scale: how far a point must be off to count as much as a force that is off by 1 N [m/N]; a
-        calibration estimates it.
+    :param force_scale: in x, y and z, how far a point must be off to count as much as a force that is off by
+        1 N [m/N]; a calibration estimates it.
     """
 
     name: str
@@ -99,7 +99,7 @@ class Trial:
     places: Floats | None = None
     loads: bool = False
     session: int = 1
-    force_scale: float = 0.05
+    force_scale: tuple[float, float, float] = (0.05, 0.05, 0.05)
 
     def __post_init__(self) -> None:
         thing = f'trial {self.name!r}'

@@ -87,7 +87,7 @@ def _forces(result: CalibrationResult) -> list[str]:
     if not forces:
         return []
     words = (f'{len(forces)} measured force{"s" * (len(forces) > 1)} on hands are '
-             f'{measured(result.force_error, "N")} from the simulated ones in each component')
+             f'{", ".join(map(number, result.force_error))} N from the simulated ones in x, y and z')
     untared = sum(not force.tared for force in forces)
     if untared:
         words += (f'; the offset of {"their" if untared == len(forces) else "some"} sensors is unknown, so '
