@@ -29,10 +29,10 @@ MOST = 100.0  # times lighter or heavier
 
 def of_forces(trials: Sequence[Trial], residuals: Floats) -> tuple[float, Floats]:
     """
-    Return by which factor measured forces exceed simulated ones, and their noise level in x, y and z, (3,) [N].
+    Return by which factor measured forces exceed simulated ones, and their noise level, (3,) in x, y, z [N].
 
-    Both together maximise the likelihood. Without the factor, a mass that is far off would seem to be noise of
-    the forces, which then could not correct it. The noise level has an inverse chi-square prior at
+    Both together maximise the likelihood. Without the factor, a mass that is far off would seem to be noise
+    of the forces, which then could not correct it. The noise level has an inverse chi-square prior at
     `USUAL_NOISE` (Gelman et al., Bayesian Data Analysis, 3rd ed., 2.6).
 
     :param residuals: (m,) [m] at the compared goals.
@@ -51,15 +51,16 @@ def of_forces(trials: Sequence[Trial], residuals: Floats) -> tuple[float, Floats
     count = USUAL_COUNT + max(len(seen) - offsets - 1 / 3, 0.0)
     factor, levels = 1.0, np.full(3, USUAL_NOISE)
     for _ in range(ROUNDS):
-        levels = np.sqrt((USUAL_COUNT * USUAL_NOISE**2 + np.sum((factor * simulated - seen)**2, axis=0)) / count)
+        power = USUAL_COUNT * USUAL_NOISE**2 + np.sum((factor * simulated - seen)**2, axis=0)
+        levels = np.sqrt(power / count)
         weighted = simulated / levels**2
-        power = float(np.sum(weighted * simulated))
-        factor = float(np.clip(np.sum(weighted * seen) / power, 1 / MOST, MOST)) if power > 0 else 1.0
+        square = float(np.sum(weighted * simulated))
+        factor = float(np.clip(np.sum(weighted * seen) / square, 1 / MOST, MOST)) if square > 0 else 1.0
     return factor, levels
 
 
 def heavier(space: ParameterSpace, point: Floats, factor: float) -> Floats:
-    """Return the (d,) point of a DLO whose free mass and stiffnesses are larger by a factor; it moves alike."""
+    """Return the (d,) point of a DLO with larger mass and stiffnesses, by a factor; it moves alike."""
     other = point.copy()
     for k, name in enumerate(space.free):
         parameter = BY_NAME[name]

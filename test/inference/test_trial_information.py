@@ -254,7 +254,7 @@ def test_an_uninformative_trial_is_named():
 
 def test_forces_make_the_mass_known_while_trials_come():
     trials, engine = felt_trials(1, lifts=LIFTS[:2]), CompiledSimulator(nodes=21)
-    space = ParameterSpace(('flexibility', 'friction', 'mass'))
+    space = ParameterSpace(('flexibility', 'elasticity', 'mass'))
 
     def after(trials):
         appraiser = Appraiser(space, Pool(engine), 0.6, 0.0, noise(trials))
@@ -269,4 +269,4 @@ def test_forces_make_the_mass_known_while_trials_come():
     numb = after([replace(trial, goals=tuple(replace(goal, forces=()) for goal in trial.goals))
                   for trial in trials])
     assert felt.uncertainty.std[2] < 0.1
-    assert numb.uncertainty.std[2] > 0.25
+    assert numb.uncertainty.std[2] > 0.2
