@@ -435,7 +435,7 @@ def plain(result: CalibrationResult) -> dict[str, Any]:
         'default_error_m': examination and examination.default_error,
         'noise_m': examination and examination.noise,
         'residual_std_m': examination and examination.uncertainty.residual,
-        'force_error_n': result.force_error.tolist(),
+        'force_error_n': None if np.isnan(result.force_error).any() else result.force_error.tolist(),
         'correlations': result.correlations,
         'advice': advice and {**asdict(advice), **{key: getattr(advice, key) * SCALE for key in (
             'std', 'expected_std', 'lower', 'upper')}},

@@ -24,7 +24,7 @@ from dlo_calibration.simulation.compiled import CompiledSimulator
 
 pytestmark = pytest.mark.usefixtures('without_drawings', 'without_slices')
 
-FLAGS = {'evaluations': 60, 'seed': 3, 'workers': 1}
+FLAGS = {'evaluations': 40, 'seed': 3, 'workers': 1}
 
 
 def simulator(_):
