@@ -15,6 +15,7 @@ from dlo_calibration.files.session import read_session as read_session
 from dlo_calibration.model.action import Action as Action
 from dlo_calibration.model.action import Hand as Hand
 from dlo_calibration.model.chain import Chain as Chain
+from dlo_calibration.model.trial import Force as Force
 from dlo_calibration.model.trial import Goal as Goal
 from dlo_calibration.model.trial import Trial as Trial
 from dlo_calibration.planning.options import PlanOptions as PlanOptions

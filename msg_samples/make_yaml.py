@@ -19,7 +19,7 @@ from typing import Sequence
 import numpy as np
 
 from dlo_calibration.files.session import read_session
-from dlo_calibration.messages.codec import ActionMessage, ChainMessage, INPUT_TYPES, NANOSECONDS, read
+from dlo_calibration.messages.codec import ActionMessage, ChainMessage, NANOSECONDS, read, TRIAL_TYPES
 
 HERE = Path(__file__).resolve().parent
 EVERY = 2  # points of a chain, so that the files stay short
@@ -79,7 +79,7 @@ TRANSFORM = """\
 def written(message: ChainMessage | ActionMessage) -> str:
     """Return a message as YAML with comments."""
     sec, nanosec = divmod(message.stamp, NANOSECONDS)
-    top = TITLE.format(kind=message.kind, type=INPUT_TYPES[message.kind], what=WHAT[message.kind]) \
+    top = TITLE.format(kind=message.kind, type=TRIAL_TYPES[message.kind], what=WHAT[message.kind]) \
         + HEADER.format(sec=sec, nanosec=nanosec, frame=message.frame_id)
     return top + (written_action(message) if isinstance(message, ActionMessage) else written_chain(message))
 
@@ -115,7 +115,7 @@ def main(arguments: Sequence[str]) -> int:
     """Write the files."""
     session = Path(arguments[0]) if arguments else HERE / 'object1'
     folder = Path(arguments[1]) if len(arguments) > 1 else HERE
-    for kind, message in read_session(session).messages[:len(INPUT_TYPES)]:
+    for kind, message in read_session(session).messages[:len(TRIAL_TYPES)]:
         (folder / f'{kind}.yaml').write_text(written(read(kind, message)), encoding='utf-8')
     return 0
 

@@ -15,6 +15,7 @@ from dlo_calibration.calibration.choice import budget
 from dlo_calibration.calibration.engines import engine_digest, SimulatorFactory
 from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.calibration.fit import Fit, fit
+from dlo_calibration.calibration.forces import weighed
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.prior import Prior
 from dlo_calibration.calibration.refinement import refine
@@ -85,6 +86,7 @@ def calibrate(trials: Sequence[Trial], options: Options | None = None, *,
         setting = Setting(tuple(trials), options, simulator, executor, should_stop, on_evaluation, memory)
         stack.callback(setting.pool.stop)
         result = fitted(setting)
+        setting = setting.weighing_forces(result.trials[0].force_scale)
         result = with_outlier(setting, result)
         confirm = stack.enter_context(confirming(
             result, second, should_stop, memory, obstacles=bool(options.scene)))
@@ -107,7 +109,7 @@ def fitted(setting: Setting) -> CalibrationResult:
     :raises SimulationError: if no evaluation could be simulated.
     """
     prior = Prior.of(setting.trials, setting.options, setting.evidence)
-    best_fit = searched(setting, prior)
+    setting, best_fit = weighed(setting, searched(setting, prior))
     best_fit = examined(setting, best_fit)
     best_fit = replace(best_fit, best=setting.judged(best_fit.space, best_fit.best))
     return CalibrationResult.of(setting, prior, best_fit)

@@ -50,7 +50,7 @@ def choose(trials: Sequence[Trial], options: Options, evidence: GripEvidence | N
     """
     words, errors = '', dict[str, float]()
     if options.calibrate == (AUTO,):
-        names, words = _parameters(trials)
+        names, words = _parameters(trials, options)
         options = replace(options, calibrate=names)
         # Chains show the errors of hands better than a simulation, whose grips are at its nodes.
         evidence = evidence or GripEvidence.of(trials)
@@ -81,7 +81,7 @@ def budget(dimension: int) -> int:
     return max(PAPER_ROUNDS, LINEARISATIONS * (dimension + 1))  # one linearisation takes d + 1
 
 
-def _parameters(trials: Sequence[Trial]) -> tuple[tuple[str, ...], str]:
+def _parameters(trials: Sequence[Trial], options: Options) -> tuple[tuple[str, ...], str]:
     """Return the parameters that the trials show, and a sentence that says why."""
     moving, between_clamps = motions(trials)
     names: tuple[str, ...] = PAPER_PARAMETERS
@@ -91,9 +91,18 @@ def _parameters(trials: Sequence[Trial]) -> tuple[tuple[str, ...], str]:
         if there:
             names += added
             words += f'; {", ".join(added)}, because {why}'
-    if names == PAPER_PARAMETERS:
+    if not options.mass and tell_mass(trials):
+        names += ('mass',)
+        words += '; mass, because forces on the hands were measured'
+    if not any(name in names for name in IN_MOTION):
         words += f'; not {", ".join(IN_MOTION)}, because no goal was seen in motion'
     return names, f'{words}.'
+
+
+def tell_mass(trials: Sequence[Trial]) -> bool:
+    """Tell whether a force on a hand was measured, or of a sensor with an unknown offset, a difference."""
+    return any(any(force.tared for *_, force in trial.forces)
+               or len({k for k, *_ in trial.forces}) > 1 for trial in trials)
 
 
 def hand_error(evidence: GripEvidence, options: Options) -> str:

@@ -190,8 +190,8 @@ class Options(DeclaredOptions):
     """
 
     mass: float = declared(
-        0.0, 'mass of the whole DLO; 0: unknown, so a density is assumed and stiffness is reported '
-        'relative to weight', unit='kg', minimum=0.0, maximum=1000.0, of=SEARCH)
+        0.0, 'mass of the whole DLO; 0: unknown: forces on hands tell it, else a density is assumed and '
+        'stiffness is reported relative to weight', unit='kg', minimum=0.0, maximum=1000.0, of=SEARCH)
     table: bool = declared(True, 'whether there is a table', of=OBSERVATION)
     table_height: float = declared(0.0, 'height of the table top', unit='m', minimum=-100.0, maximum=100.0,
                                    of=OBSERVATION)
@@ -222,7 +222,7 @@ class Options(DeclaredOptions):
         (AUTO,), "names of the parameters to find; all others keep their fixed value; auto: the paper's four "
         '(flexibility, elasticity, friction, self_collision), and what the trials show besides: damping and '
         'internal_damping if goals were seen in motion; torsion, bending_friction and bending_slip if that '
-        'was between two clamps',
+        'was between two clamps; mass if it is unknown and forces on hands were measured',
         choices=(AUTO, *BY_NAME), of=SEARCH)
     own: tuple[str, ...] = declared(
         (), 'names of the parameters that differ from session to session, if several sessions of one DLO are '

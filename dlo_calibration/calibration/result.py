@@ -228,6 +228,16 @@ class CalibrationResult:
         return noise(self.trials) if self.examination is None else self.examination.noise
 
     @cached_property
+    def force_error(self) -> Floats:
+        """Root mean square of how far simulated forces are off in x, y and z, (3,) [N]; nan: not measured."""
+        residuals = self.best.residuals
+        rows = zip(self.trials, ResidualLayout.of(self.trials).force_rows, strict=True)
+        if residuals is None or not any(trial.forces for trial in self.trials):
+            return np.full(3, np.nan)
+        off = np.concatenate([residuals[row].reshape(-1, 3) / trial.force_scale for trial, row in rows])
+        return np.asarray(np.sqrt(np.mean(off**2, axis=0)))
+
+    @cached_property
     def parameters(self) -> Mapping[str, ParameterEstimate]:
         """The calibrated parameters; none of an unusable result is identifiable."""
         if not self.unusable:
@@ -402,7 +412,7 @@ def combination(names: Sequence[str], vector: Floats) -> str:
 def trial_errors(trials: Sequence[Trial], evaluation: Evaluation) -> tuple[Floats, ...]:
     """Return the point errors [m] of each trial, from an evaluation of every goal."""
     assert evaluation.residuals is not None
-    return tuple(distances(evaluation.residuals[rows]) for rows in ResidualLayout.of(trials).rows)
+    return tuple(distances(evaluation.residuals[rows]) for rows in ResidualLayout.of(trials).point_rows)
 
 
 def simulated_chains(trials: Sequence[Trial], evaluation: Evaluation) -> tuple[Floats, ...]:
@@ -453,6 +463,7 @@ def plain(result: CalibrationResult) -> dict[str, Any]:
         'default_error_m': examination and examination.default_error,
         'noise_m': examination and examination.noise,
         'residual_std_m': examination and examination.uncertainty.residual,
+        'force_error_n': None if np.isnan(result.force_error).any() else result.force_error.tolist(),
         'correlations': result.correlations,
         'advice': advice and {**asdict(advice), **advice.of_hundred},
         'explanations': {missing.name: missing.share for missing in result.missing_parameters},

@@ -6,7 +6,8 @@
 from __future__ import annotations
 
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+import copy
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Callable
 
@@ -57,6 +58,15 @@ class Setting:
         object.__setattr__(self, 'choice', choose(trials, self.options, evidence))
         object.__setattr__(self, 'options', self.choice.options)
         object.__setattr__(self, 'trials', with_shared_places(trials))
+
+    def weighing_forces(self, scale: tuple[float, float, float]) -> Setting:
+        """Return the same setting, in whose trials forces count by another scale, see `Trial` [m/N]."""
+        if scale == self.trials[0].force_scale:
+            return self
+        other = copy.copy(self)
+        object.__setattr__(other, 'trials', tuple(replace(trial, force_scale=scale) for trial in self.trials))
+        other.__dict__.pop('_evaluator', None)
+        return other
 
     @property
     def hand_error(self) -> str:

@@ -12,7 +12,7 @@ from dlo_calibration.calibration.choice import choose
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.cli.arguments import add_source, selected
 from dlo_calibration.cli.output import print_json, standard_output
-from dlo_calibration.messages.codec import ACTION, GOAL, INITIAL, INPUT_TYPES
+from dlo_calibration.messages.codec import ACTION, GOAL, INITIAL, INPUT_TYPES, WRENCH
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.workspace.source import read_source, Source
 
@@ -54,11 +54,13 @@ def _about(source: Source) -> dict[str, Any]:
 def _about_topic(topic: str, kind: str, count: int) -> dict[str, Any]:
     """Describe a topic that the calibrator does not know, with a hint which input it could be."""
     fits = [name for name, needed in INPUT_TYPES.items() if needed == kind]
-    hint = f'if {topic} has the actions, add --remap {topic}:={ACTION}'
+    has = {ACTION: 'the actions', WRENCH: 'the forces on a hand'}
+    hint = ''.join(f'if {topic} has {words}, add --remap {topic}:={name}'
+                   for name, words in has.items() if name in fits)
     if GOAL in fits:
         hint = f'if {topic} has the chains after the actions, add --remap {topic}:={GOAL}; if it has those ' \
                f'before them, {topic}:={INITIAL}'
-    return {'topic': topic, 'type': kind, 'messages': count, 'hint': hint if fits else ''}
+    return {'topic': topic, 'type': kind, 'messages': count, 'hint': hint}
 
 
 def _about_trial(number: int, trial: Trial) -> dict[str, Any]:
@@ -74,6 +76,7 @@ def _about_trial(number: int, trial: Trial) -> dict[str, Any]:
         'timed_goals': sum(not goal.stable for goal in trial.goals),
         'duration_s': max(trial.goals[-1].time, *(hand.end for hand in trial.hands)),
         'moving_start': trial.velocity is not None,
+        'forces': len(trial.forces),
         'unseen_points': int(sum((~chain.seen).sum() for chain in chains)),
         'annotated_hands': any(chain.hands is not None for chain in chains),
         'annotated_features': int(sum(chain.features.sum() for chain in chains))}

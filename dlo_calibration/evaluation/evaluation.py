@@ -16,7 +16,7 @@ from dlo_calibration.errors import SimulationError
 from dlo_calibration.evaluation.residuals import compared_rows, ResidualLayout
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import HANDS, of_session, ParameterSpace
-from dlo_calibration.model.score import PointErrors, residuals, TrialScore
+from dlo_calibration.model.score import force_residuals, PointErrors, residuals, TrialScore
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.simulation.protocol import Job, Rollout, simulate_all, Simulator, Stop
 
@@ -132,7 +132,11 @@ class Evaluator:
                                      for score, rollout in zip(self._scores, rollouts, strict=True)),
             unsettled=tuple(trial.name for trial, rollout in zip(self.trials, rollouts, strict=True)
                             if not all(rollout.settled)))
-        residual = np.concatenate([residuals(trial, rollout.chains)
-                                   for trial, rollout in zip(self.trials, rollouts, strict=True)])
+        each = [residuals(trial, rollout.chains)
+                for trial, rollout in zip(self.trials, rollouts, strict=True)]
+        forces = [force_residuals(trial, rollout.forces)
+                  for trial, rollout in zip(self.trials, rollouts, strict=True)]
+        residual = np.concatenate([part for both in zip(each, forces, strict=True) for part in both])
         compared = residual if self._rows is None else residual[self._rows]
-        return replace(evaluation, errors=PointErrors.of(residual), residuals=frozen_array(compared))
+        return replace(evaluation, errors=PointErrors.of(np.concatenate(each)),
+                       residuals=frozen_array(compared))

@@ -225,11 +225,12 @@ class Memory:
         goals, points, numbers = len(job[0].goals), len(job[0].initial), entry.numbers
         if not len(numbers):
             return SimulationError(entry.text)
-        if len(numbers) != 2 + goals + 3 * goals * points:  # a stranger's entry
+        end = 2 + goals + 3 * goals * points
+        if len(numbers) != end + 3 * len(job[0].forces):  # a stranger's entry
             return None
         settled = tuple(bool(flag) for flag in numbers[2:2 + goals])
-        return Rollout(np.reshape(numbers[2 + goals:], (goals, points, 3)), settled, float(numbers[0]),
-                       int(numbers[1]))
+        return Rollout(np.reshape(numbers[2 + goals:end], (goals, points, 3)), settled, float(numbers[0]),
+                       int(numbers[1]), forces=np.reshape(numbers[end:], (-1, 3)))
 
     def add_rollouts(self, simulator: str, jobs: Sequence[Job], rollouts: list[Rollout | SimulationError]
                      ) -> list[Rollout | SimulationError]:
@@ -237,7 +238,8 @@ class Memory:
         if self._log is not None:
             for job, rollout in zip(jobs, rollouts, strict=True):
                 entry = Entry(np.zeros(0), str(rollout)) if isinstance(rollout, SimulationError) else Entry(
-                    np.array([rollout.duration, rollout.steps, *rollout.settled, *rollout.chains.ravel()]))
+                    np.array([rollout.duration, rollout.steps, *rollout.settled, *rollout.chains.ravel(),
+                              *rollout.forces.ravel()]))
                 self.add(self._key(simulator, job), entry)
         return rollouts
 

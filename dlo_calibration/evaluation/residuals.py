@@ -45,17 +45,19 @@ def compared_goals(trial: Trial) -> list[int]:
 @dataclass(frozen=True)
 class ResidualLayout:
     """
-    The order of a residual vector (m,): by trial, goal, point and coordinate.
+    The order of a residual vector (m,): by trial, goal, point and coordinate; last in each trial, its forces.
 
     Points that were not seen have no residuals. The rows of its Jacobian have the same order.
 
     :param shapes: numbers of goals and points of each of T trials.
     :param unseen: for each trial, the indices of unseen points: goal times the number of points, plus point;
         empty: all points of all trials were seen.
+    :param forces: numbers of measured forces of the trials; empty: none.
     """
 
     shapes: tuple[tuple[int, int], ...]
     unseen: tuple[tuple[int, ...], ...] = ()
+    forces: tuple[int, ...] = ()
 
     @classmethod
     def of(cls, trials: Sequence[Trial]) -> ResidualLayout:
@@ -72,19 +74,45 @@ class ResidualLayout:
         unseen = tuple(tuple(np.flatnonzero(~seen_points(trial)[goals]).tolist())
                        for trial, goals in zip(trials, chosen, strict=True))
         shapes = ((len(goals), len(trial.initial)) for trial, goals in zip(trials, chosen, strict=True))
-        return cls(tuple(shapes), unseen if any(unseen) else ())
+        forces = tuple(sum(k in goals for k, *_ in trial.forces)
+                       for trial, goals in zip(trials, map(set, chosen), strict=True))
+        return cls(tuple(shapes), unseen if any(unseen) else (), forces if any(forces) else ())
 
     @property
     def rows(self) -> list[slice]:
         """The rows of each trial, T slices."""
         unseen = [len(indices) for indices in self.unseen] or [0] * len(self.shapes)
-        ends = np.cumsum([0, *(3 * (goals * points - count) for (goals, points), count
-                               in zip(self.shapes, unseen, strict=True))]).tolist()
+        ends = np.cumsum([0, *(3 * (goals * points - count + forces) for (goals, points), count, forces
+                               in zip(self.shapes, unseen, self._forces, strict=True))]).tolist()
         return [slice(begin, end) for begin, end in zip(ends[:-1], ends[1:], strict=True)]
+
+    @property
+    def point_rows(self) -> list[slice]:
+        """The rows of the points of each trial, T slices."""
+        return [slice(rows.start, rows.stop - 3 * forces)
+                for rows, forces in zip(self.rows, self._forces, strict=True)]
+
+    @property
+    def force_rows(self) -> list[slice]:
+        """The rows of the forces of each trial, T slices."""
+        return [slice(rows.stop - 3 * forces, rows.stop)
+                for rows, forces in zip(self.rows, self._forces, strict=True)]
+
+    @property
+    def _forces(self) -> tuple[int, ...]:
+        return self.forces or (0,) * len(self.shapes)
+
+    def points(self, residuals: Floats, within: slice = slice(None)) -> Floats:
+        """Return those of (m,) residuals that are of points, and within some rows."""
+        end = self.rows[-1].stop
+        begin, stop, _ = within.indices(end)
+        return np.concatenate([residuals[max(rows.start, begin):min(rows.stop, stop)] for rows
+                               in self.point_rows if rows.start < stop and rows.stop > begin])
 
     def without(self, k: int) -> ResidualLayout:
         """Return the layout of the residuals of all trials but the one with the index k."""
-        return ResidualLayout(self.shapes[:k] + self.shapes[k + 1:], self.unseen[:k] + self.unseen[k + 1:])
+        return ResidualLayout(self.shapes[:k] + self.shapes[k + 1:], self.unseen[:k] + self.unseen[k + 1:],
+                              self.forces[:k] + self.forces[k + 1:])
 
     def folds(self, most: int) -> list[slice]:
         """Return the rows of at most `most` folds of a cross-validation, each of neighbouring trials."""
@@ -93,19 +121,20 @@ class ResidualLayout:
         return [slice(rows[group[0]].start, rows[group[-1]].stop) for group in groups]
 
     def aligned(self, values: Floats) -> list[Floats]:
-        """Split (m, ...) values by trial, with a row per goal, point and coordinate, 0 if unseen."""
-        return [np.nan_to_num(self._spread(k, values[rows].reshape(-1, 3, *values.shape[1:]))).reshape(
-            -1, *values.shape[1:]) for k, rows in enumerate(self.rows)]
+        """Split (m, ...) values by trial: a row per goal, point and coordinate, 0 if unseen; then forces."""
+        return [np.concatenate([np.nan_to_num(self._spread(k, values[rows].reshape(
+            -1, 3, *values.shape[1:]))).reshape(-1, *values.shape[1:]), values[forces]])
+            for k, (rows, forces) in enumerate(zip(self.point_rows, self.force_rows, strict=True))]
 
     def chains(self, residuals: Floats) -> list[Floats]:
         """Split (m,) residuals [m] into one array (goals, points, 3) [m] per trial; NaN at unseen points."""
         return [self._spread(k, residuals[rows].reshape(-1, 3)).reshape(*shape, 3)
-                for k, (rows, shape) in enumerate(zip(self.rows, self.shapes, strict=True))]
+                for k, (rows, shape) in enumerate(zip(self.point_rows, self.shapes, strict=True))]
 
     def by_point(self, values: Floats) -> list[Floats]:
-        """Split (m / 3,) values, one per seen point, into one array (goals, points) per trial; else NaN."""
+        """Split (m / 3,) values, one per seen point or force, into (goals, points) per trial; else NaN."""
         return [self._spread(k, values[rows.start // 3:rows.stop // 3]).reshape(shape)
-                for k, (rows, shape) in enumerate(zip(self.rows, self.shapes, strict=True))]
+                for k, (rows, shape) in enumerate(zip(self.point_rows, self.shapes, strict=True))]
 
     def _spread(self, k: int, seen: NDArray[Any]) -> NDArray[Any]:
         """Return values of all points of trial k, from those of its seen points; NaN at unseen points."""
@@ -124,15 +153,20 @@ def compared_rows(trials: Sequence[Trial]) -> NDArray[np.intp] | None:
         return None
     layout = ResidualLayout.of(trials)
     places = layout.chains(np.arange(layout.rows[-1].stop))
-    rows = np.concatenate([block[goals].ravel() for block, goals in zip(places, chosen, strict=True)])
-    return np.asarray(rows[np.isfinite(rows)], np.intp)
+    rows = []
+    for trial, block, goals, forces in zip(trials, places, chosen, layout.force_rows, strict=True):
+        compared = np.isin([k for k, *_ in trial.forces], goals)
+        rows += [block[goals].ravel(), np.arange(forces.start, forces.stop)[np.repeat(compared, 3)]]
+    every = np.concatenate(rows)
+    return np.asarray(every[np.isfinite(every)], np.intp)
 
 
 def at_every_goal(values: Floats, trials: Sequence[Trial]) -> Floats:
     """
     Return values for the points of every goal, from (p,) values for the points of the compared goals.
 
-    Values of a point are interpolated linearly in time between the compared goals that show it.
+    Values of a point are interpolated linearly in time between the compared goals that show it; at the places
+    of forces, there is NaN.
     """
     filled = []
     for trial, block in zip(trials, ResidualLayout.compared(trials).by_point(values), strict=True):
@@ -142,7 +176,7 @@ def at_every_goal(values: Floats, trials: Sequence[Trial]) -> Floats:
                           np.full(len(times), mean)
                           for seen, column in zip(np.isfinite(block.T), block.T, strict=True)], axis=1)
         whole[goals] = np.where(np.isfinite(block), block, whole[goals])
-        filled.append(whole[seen_points(trial)])
+        filled += [whole[seen_points(trial)], np.full(len(trial.forces), np.nan)]
     return np.concatenate(filled)
 
 

@@ -20,7 +20,14 @@ from typing import Any, Callable, Iterable, Mapping
 
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.record import decode, Record
-from dlo_calibration.messages.codec import INITIAL, INPUT_TYPES, NANOSECONDS, OUTPUT_TYPES
+from dlo_calibration.messages.codec import (
+    INITIAL,
+    INPUT_TYPES,
+    NANOSECONDS,
+    OUTPUT_TYPES,
+    TRIAL_TYPES,
+    WRENCH,
+)
 from dlo_calibration.model.parameters import from_first_scale, SCALE
 
 USED_TYPES: Mapping[str, str] = {**INPUT_TYPES, **OUTPUT_TYPES}
@@ -100,10 +107,14 @@ class Bag:
             raise LimitExceeded(f'it has more than {self._messages - 1} messages in {self._size} bytes')
 
     def keep(self, record: Record) -> None:
-        """Keep a message; the outputs of the node take at most half of the room."""
+        """Keep a message; the outputs of the node, and wrenches, take at most half of the room."""
         limit = min(KEPT_MESSAGES, max(KEPT_OF_ANY, self._size // MESSAGE_OCTETS))
-        if record.type not in INPUT_TYPES.values() and (
+        if record.type not in TRIAL_TYPES.values() and (
                 2 * len(self.records) >= limit or 2 * self._octets > KEPT_OCTETS):
+            if record.type == INPUT_TYPES[WRENCH] and record.topic not in self._left_out:
+                self._left_out.add(record.topic)
+                self.warnings.append(f'topic {record.topic} is not read to its end: publish 100 wrenches a '
+                                     'second at most')
             return
         self._octets += len(record.data)
         if len(self.records) >= limit or self._octets > KEPT_OCTETS:
@@ -191,6 +202,8 @@ def _discarded(records: list[Record], discards: Iterable[tuple[int, int]]) -> se
     """
     stamped = []
     for k, record in enumerate(records):
+        if record.name == WRENCH:  # they may show the hand before the next trial
+            continue
         with suppress(InputError):  # decoding again reports it later
             stamp = decode(record).header.stamp
             stamped.append((stamp.sec * NANOSECONDS + stamp.nanosec, record.name != INITIAL, k))

@@ -33,7 +33,7 @@ from dlo_calibration.model.named_actions import (
 )
 from dlo_calibration.model.parameters import SCALES
 from dlo_calibration.model.pose import Pose
-from dlo_calibration.model.trial import Goal, Trial
+from dlo_calibration.model.trial import Force, Goal, Trial
 from dlo_calibration.writing import write_file
 
 WHAT = 'request'  # in errors
@@ -48,12 +48,14 @@ class GoalRequest:
     :param time: seconds since the start of the trial.
     :param stable: True: compared when the simulated DLO has come to rest; False: at that instant.
     :param held_by: names of the hands that hold the DLO; None: those that still hold it after the actions.
+    :param forces: see `Goal`.
     """
 
     chain: Chain
     time: float
     stable: bool = True
     held_by: tuple[str, ...] | None = None
+    forces: tuple[Force, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,8 @@ class TrialRequest:
     @classmethod
     def of(cls, trial: Trial) -> TrialRequest:
         """Return the request for an observed trial."""
-        goals = tuple(GoalRequest(goal.chain, goal.time, goal.stable, goal.held_by) for goal in trial.goals)
+        goals = tuple(GoalRequest(goal.chain, goal.time, goal.stable, goal.held_by, goal.forces)
+                      for goal in trial.goals)
         return cls(trial.name, trial.initial, trial.actions, goals, trial.velocity)
 
     def moved(self, pose: Pose) -> TrialRequest:
@@ -99,7 +102,8 @@ class TrialRequest:
             self, initial=pose.chain(self.initial), actions=tuple(
                 pose.action(action) if isinstance(action, Action) else pose.named_action(action)
                 for action in self.actions),
-            goals=tuple(replace(goal, chain=pose.chain(goal.chain)) for goal in self.goals),
+            goals=tuple(replace(goal, chain=pose.chain(goal.chain), forces=pose.forces(goal.forces))
+                        for goal in self.goals),
             velocity=None if self.velocity is None else pose.vectors(self.velocity))
 
     def trial(self, release: bool = True) -> Trial:
@@ -126,7 +130,7 @@ class TrialRequest:
             held_by = goal.held_by
             if held_by is None:
                 held_by = tuple(name for name, hold in last.items() if hold)
-            goals.append(Goal(goal.chain, goal.time, goal.stable, held_by))
+            goals.append(Goal(goal.chain, goal.time, goal.stable, held_by, forces=goal.forces))
         return Trial(self.name, self.initial, tuple(done), tuple(goals), self.velocity)
 
     def manipulation(self, release: bool = True) -> Manipulation:
@@ -202,8 +206,12 @@ class Request:
             for action in trial.actions:
                 _add_action(element, action)
             for goal in trial.goals:
-                xml.add_points(xml.add(element, 'goal_chain', time=goal.time, stable=goal.stable,
-                                       held_by=goal.held_by), goal.chain)
+                observed = xml.add(element, 'goal_chain', time=goal.time, stable=goal.stable,
+                                   held_by=goal.held_by)
+                xml.add_points(observed, goal.chain)
+                for force in goal.forces:
+                    x, y, z = force.vector.tolist()
+                    xml.add(observed, 'force', hand=force.hand, x=x, y=y, z=z, tared=force.tared)
         return xml.document(root)
 
 
@@ -316,10 +324,16 @@ def _trial(where: str, element: Any) -> TrialRequest:
 
 
 def _goal(where: str, element: Any) -> GoalRequest:
-    goal = GoalRequest(xml.read_chain(where, element), **xml.attributes(where, element, GoalRequest))
+    goal = GoalRequest(xml.read_chain(where, element), **xml.attributes(where, element, GoalRequest),
+                       forces=tuple(_force(where, force) for force in element.findall('force')))
     if abs(goal.time) > MAXIMUM_TIME:
         raise xml.refused(where, element, f'a time of {goal.time:g} s', f'at most {MAXIMUM_TIME:g} s')
     return goal
+
+
+def _force(where: str, element: Any) -> Force:
+    with xml.located(where, element):
+        return Force(vector=xml.read_vectors(where, [element])[0], **xml.attributes(where, element, Force))
 
 
 def _action(where: str, element: Any) -> Union[NamedAction, Action]:

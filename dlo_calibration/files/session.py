@@ -22,7 +22,18 @@ from dlo_calibration.calibration.options import file_options, FileOptions, Optio
 from dlo_calibration.errors import DEFECT, InputError, one_of, safe_line, suggestion
 from dlo_calibration.files.bag_reader import read_bag
 from dlo_calibration.files.record import decode, encode, Record
-from dlo_calibration.messages.codec import bag_types, built, GOAL, INPUT_TYPES, Key, Message, read, repeats
+from dlo_calibration.messages.codec import (
+    bag_types,
+    built,
+    GOAL,
+    INPUT_TYPES,
+    InputMessage,
+    Key,
+    read,
+    repeats,
+    TRIAL_TYPES,
+    WRENCH,
+)
 from dlo_calibration.messages.collector import StampOrder, TrialCollector, went_back
 from dlo_calibration.messages.encoder import trial_messages
 from dlo_calibration.messages.refusals import counted
@@ -42,7 +53,7 @@ class Session:
     :param warnings: those of the options, and one text for each defect that did not prevent reading.
     :param counts: number of recorded messages by topic, also of those that other programs use.
     :param duration: time from the first to the last of these [s].
-    :param frames: the frame_ids of `inputs`, sorted.
+    :param frames: the frame_ids of chains and actions in `inputs`, sorted.
     :param others: topics that are neither inputs nor outputs of the calibrator, and their types.
     """
 
@@ -101,7 +112,7 @@ def trial_records(trials: Iterable[Trial], frame_id: str = 'world') -> tuple[Rec
     return message_records(trial_messages(tuple(trials), frame_id))
 
 
-def message_records(messages: Iterable[Message]) -> tuple[Record, ...]:
+def message_records(messages: Iterable[InputMessage]) -> tuple[Record, ...]:
     """Return the records of a session with the given messages."""
     types, records = bag_types(), []
     for message in messages:
@@ -126,7 +137,7 @@ def session_trials(session: Session, options: Options, note: Callable[[str], obj
         trials += collector.trials
         early += collector.take_early()
         refusals += [text for _, text in refused]
-        refusals += map(str, (*collector.refusals, *collector.loose_end))
+        refusals += map(str, (*collector.refusals, *collector.loose_end, *collector.force_problems))
     for text in counted(early):
         note(text)
     named = (replace(trial, name=f'trial {k}') for k, trial in enumerate(trials, start=1))
@@ -167,10 +178,10 @@ def session_manipulations(session: Session,
     return tuple(named), counted(refusals)
 
 
-def _by_clock(session: Session) -> tuple[list[list[Message]], list[str]]:
+def _by_clock(session: Session) -> tuple[list[list[InputMessage]], list[str]]:
     """Return the messages before and after each jump of the clock, and why others are not used."""
     order, refusals = StampOrder(), []
-    clocks: list[list[Message]] = [[]]
+    clocks: list[list[InputMessage]] = [[]]
     for record in session.inputs:
         try:
             content = read(record.name, decode(record))
@@ -188,7 +199,7 @@ def _by_clock(session: Session) -> tuple[list[list[Message]], list[str]]:
             clocks.append([])
         order.add(content)
         clocks[-1].append(content)
-    earlier: dict[Key, Message] = {}
+    earlier: dict[Key, InputMessage] = {}
     for k, messages in enumerate(clocks):
         fresh = [message for message in messages
                  if message.key not in earlier or not repeats(message, earlier[message.key])]
@@ -200,7 +211,7 @@ def _by_clock(session: Session) -> tuple[list[list[Message]], list[str]]:
     return clocks, refusals
 
 
-def _collected(messages: Iterable[Message],
+def _collected(messages: Iterable[InputMessage],
                options: Options) -> tuple[TrialCollector, list[tuple[str, str]]]:
     """Collect the messages of one clock; also return the kind of each refused message, and why."""
     collector = TrialCollector(options)
@@ -239,11 +250,11 @@ def read_session(path: str | Path, namespace: str | None = None, remap: Mapping[
     try:
         topics = _input_topics(path, seen, namespace, remap, warnings)
     except InputError as error:
-        if not any_topics or not seen or any(INPUT_TYPES.get(topic.rsplit('/', 1)[-1]) == kind
+        if not any_topics or not seen or any(TRIAL_TYPES.get(topic.rsplit('/', 1)[-1]) == kind
                                              for topic, kind in seen):
             raise
         topics = frozenset()
-        warnings.append(f'no topic is one of {", ".join(INPUT_TYPES)}; {error.remedy}')
+        warnings.append(f'no topic is one of {", ".join(TRIAL_TYPES)}; {error.remedy}')
     inputs = [record for record in records
               if record.topic in topics and record.type == INPUT_TYPES[record.name]]
     usable, frames = _checked(bag.used(inputs), warnings)
@@ -267,13 +278,14 @@ def _checked(records: Iterable[Record],
     more: Counter[str] = Counter()
     for record in records:
         try:
-            frame = decode(record).header.frame_id
+            header = decode(record).header
         except InputError as error:
             more[record.topic] += record.topic in bad
             bad.setdefault(record.topic, error)
             continue
         good.append(record)
-        frames.add(frame)
+        if record.name != WRENCH:  # which names a hand
+            frames.add(header.frame_id)
     warnings += [f'{error}; and {more[topic]} more of {topic}' if more[topic] else str(error)
                  for topic, error in bad.items()]
     return tuple(good), tuple(sorted(frames))
@@ -302,16 +314,18 @@ def _input_topics(path: Path, seen: Iterable[tuple[str, str]], namespace: str | 
             warnings.append(f'topic {record.topic} is left out, as another one is read as {record.name}')
             continue
         if record.type == INPUT_TYPES.get(record.name):
-            if namespace is None or record.namespace.strip('/') == namespace.strip('/'):
+            if record.name == WRENCH or namespace is None or \
+                    record.namespace.strip('/') == namespace.strip('/'):
                 candidates[record.name].append(record)
         elif record.name in INPUT_TYPES:
             warnings.append(f'topic {record.topic} is left out: it is a {record.type}, '
                             f'not a {INPUT_TYPES[record.name]}')
+    forces = candidates.pop(WRENCH, [])  # each names its hand, so that any number of them can be read
     if not (remap or any(candidates.values())):
         held = ', '.join(sorted(f'{topic} ({kind})' for topic, kind in seen)) or 'no messages'
         raise InputError(
             f'session {path}', f'{held} ({warnings[-1]})' if warnings else held,
-            'at least one of ' + ', '.join(f'{kind} ({text})' for kind, text in INPUT_TYPES.items())
+            'at least one of ' + ', '.join(f'{kind} ({text})' for kind, text in TRIAL_TYPES.items())
             + ('' if namespace is None else f' in namespace {namespace}'),
             'record these topics, or name others with --remap TOPIC:=goal_chain' if namespace is None else
             'correct the namespace')
@@ -326,7 +340,8 @@ def _input_topics(path: Path, seen: Iterable[tuple[str, str]], namespace: str | 
         warnings.append(f'topics outside the namespace {complete[0]} are left out')
         candidates = {kind: [r for r in choice if r.namespace == complete[0].rstrip('/')]
                       for kind, choice in candidates.items()}
-    return frozenset([*remap, *(record.topic for choice in candidates.values() for record in choice)])
+    chosen = (*forces, *(record for choice in candidates.values() for record in choice))
+    return frozenset([*remap, *(record.topic for record in chosen)])
 
 
 def samples() -> Path:

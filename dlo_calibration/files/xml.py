@@ -214,20 +214,21 @@ def add_points(element: Any, chain: Chain) -> None:
 
 def read_chain(where: str, element: Any) -> Chain:
     """Return the chain that an element contains."""
-    annotated = [point.get('hand') for point in element]
+    points = element.findall('point')
+    annotated = [point.get('hand') for point in points]
     if None in annotated and any(hand is not None for hand in annotated):
-        point = element[annotated.index(None)]
+        point = points[annotated.index(None)]
         raise refused(where, point, "no attribute 'hand'",
                       'the attribute at all points of the chain, or at none')
     with located(where, element):
-        return Chain(read_vectors(where, element),
+        return Chain(read_vectors(where, points),
                      None if None in annotated else np.array([int(hand) for hand in annotated], np.uint8),
-                     np.array([point.get('feature') == 'true' for point in element]),
-                     np.array([point.get('seen') != 'false' for point in element]))
+                     np.array([point.get('feature') == 'true' for point in points]),
+                     np.array([point.get('seen') != 'false' for point in points]))
 
 
 def read_vectors(where: str, element: Any) -> Floats:
-    """Return the attributes x y z of all children of an element, (n, 3)."""
+    """Return the attributes x y z of all children of an element, or of a list of elements, (n, 3)."""
     return np.array([[number(where, child, axis) for axis in 'xyz'] for child in element], dtype=float)
 
 

@@ -36,6 +36,7 @@ from dlo_calibration.model.action import Action
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.named_actions import Drag, GraspAndPlace, LiftAndHold, NamedAction, TwoHands
 from dlo_calibration.model.parameters import BY_NAME, number, ParameterSpace, SCALE
+from dlo_calibration.model.score import force_residuals
 from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.observation.excitation import excites
 
@@ -153,7 +154,7 @@ def sensitivities(trials: Sequence[Trial], space: ParameterSpace, pool: Pool, po
                   length: float, *, shown: NDArray[np.bool_], at_rest: bool = True,
                   recorded: bool = False) -> list[Floats | SimulationError]:
     """
-    Return the (m, d) derivatives of the simulated chains of each trial [m per unit].
+    Return the (m, d) derivatives of the simulated chains, and then forces, of each trial [m per unit].
 
     The central differences have steps of the standard deviations, because the chains may be nonlinear within
     such a distance.
@@ -185,8 +186,9 @@ def sensitivities(trials: Sequence[Trial], space: ParameterSpace, pool: Pool, po
             elif at_rest and not all(rollout.settled):
                 failure = SimulationError(f'trial {trial.name!r} does not come to rest')
             else:
-                chains.append(rollout.chains.ravel())
-        unknown = np.zeros((3 * len(trial.goals) * len(trial.initial), len(point)))
+                chains.append(np.append(rollout.chains, force_residuals(trial, rollout.forces)))
+        count = len(trial.goals) * len(trial.initial) + len(trial.forces)
+        unknown = np.zeros((3 * count, len(point)))
         derivatives.append(differences.jacobian(unknown, chains) if failure is None else failure)
     return derivatives
 

@@ -42,7 +42,7 @@ def left_out_errors(model: Linearisation, layout: ResidualLayout, residuals_at: 
     weighted = model.weighted(loss.roots(model.residuals) / scale)
     folds = layout.folds(MOST_FOLDS)
     steps = np.clip(jackknife(weighted, folds, prior_information(dimension)), -WIDEST, WIDEST)
-    errors = [distances(model.residuals[rows]) for rows in folds]
+    errors = [distances(layout.points(model.residuals, rows)) for rows in folds]
     unsure = list(range(len(folds)))
     for shorter in (1.0, 0.5, 0.25):
         points = np.clip(model.point + shorter * steps[unsure], 0.0, model.upper)
@@ -52,7 +52,7 @@ def left_out_errors(model: Linearisation, layout: ResidualLayout, residuals_at: 
             if residuals is None or loss.cost(residuals[others]) > loss.cost(model.residuals[others]):
                 worse.append(k)
             else:
-                errors[k] = distances(residuals[folds[k]])
+                errors[k] = distances(layout.points(residuals, folds[k]))
         unsure = worse
         if not unsure:
             break

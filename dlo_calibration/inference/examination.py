@@ -130,7 +130,7 @@ def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: 
         uncertainty=uncertainty, jacobian=frozen_array(fit.jacobian), noise=noise,
         regular=_converged(fit, uncertainty),
         cross_validated=float(np.concatenate(fold_errors).mean()) if fold_errors else float('nan'),
-        default_error=float('nan') if at_default is None else PointErrors.of(at_default).mean,
+        default_error=float('nan') if at_default is None else PointErrors.of(layout.points(at_default)).mean,
         evaluations=count)
 
 

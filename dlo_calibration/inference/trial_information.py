@@ -54,7 +54,7 @@ from dlo_calibration.model.parameters import (
     REST_SHAPE,
     SCALE,
 )
-from dlo_calibration.model.score import distances, residuals, seen_points
+from dlo_calibration.model.score import distances, force_residuals, residuals, seen_points
 from dlo_calibration.model.trial import Goal, shown_goals, Trial
 from dlo_calibration.observation.excitation import excites
 from dlo_calibration.observation.noise import NO_NOISE, with_other_noise
@@ -215,8 +215,10 @@ class Appraisal:
 
     def outlier(self, trials: Sequence[Trial]) -> str:
         """Say which of the appraised trials does not fit the others; '' if all do."""
-        errors = np.array([distances(model.fit.predicted(self.point - model.fit.point)).mean()
-                           for model in self.models])
+        errors = np.array([
+            distances(ResidualLayout.of([without_repeated_goals(trial)]).points(
+                model.fit.predicted(self.point - model.fit.point))).mean()
+            for trial, model in zip(trials, self.models, strict=False)])
         k = candidate(errors)
         if k is None or not is_outlier(k, errors):
             return ''
@@ -399,7 +401,7 @@ class Appraiser:
         rollout, = (pool or self.pool).simulate([(with_hands(trial, physical), physical)])
         if isinstance(rollout, SimulationError):
             raise rollout
-        return residuals(trial, rollout.chains)
+        return np.append(residuals(trial, rollout.chains), force_residuals(trial, rollout.forces))
 
     def _model(self, trial: Trial, point: Floats, std: Floats) -> TrialModel:
         """Simulate a trial around a (d,) point; a parameter that it certainly cannot show is not varied."""
@@ -408,7 +410,7 @@ class Appraiser:
                                   shown=shown[None], at_rest=False, recorded=True)
         if isinstance(jacobian, SimulationError):
             raise jacobian
-        rows = np.repeat(seen_points(trial).ravel(), 3)
+        rows = np.repeat(np.append(seen_points(trial), np.ones(len(trial.forces), bool)), 3)
         return TrialModel(Linearisation(point, here, jacobian[rows], self.space.upper),
                           np.zeros((STARTS, len(here))), np.zeros(len(here)))
 

@@ -296,6 +296,7 @@ def similar_trials(fit: Linearisation, layout: ResidualLayout) -> list[list[int]
     groups: list[list[int]] = []
     for k, side in enumerate(sides):
         similar = [group for group in groups if layout.shapes[group[0]] == layout.shapes[k]
+                   and len(sides[group[0]]) == len(side)
                    and float(sides[group[0]] @ side) >= SIMILAR * sizes[group[0]] * sizes[k]]
         if similar:
             similar[0].append(k)

@@ -16,13 +16,16 @@ from numpy.typing import NDArray
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.action import check_waypoints, MAXIMUM_HANDS
 from dlo_calibration.model.chain import Chain, check_ends, Floats, frozen_array, MOST_POINTS
+from dlo_calibration.model.trial import LARGEST_FORCE
 
-INITIAL, ACTION, GOAL = 'initial_chain', 'action', 'goal_chain'
-INPUT_TYPES: Mapping[str, str] = {
+INITIAL, ACTION, GOAL, WRENCH = 'initial_chain', 'action', 'goal_chain', 'wrench'
+#: What every trial needs.
+TRIAL_TYPES: Mapping[str, str] = {
     INITIAL: 'sensor_msgs/msg/PointCloud2',
     ACTION: 'trajectory_msgs/msg/MultiDOFJointTrajectory',
     GOAL: 'sensor_msgs/msg/PointCloud2',
 }
+INPUT_TYPES: Mapping[str, str] = {**TRIAL_TYPES, WRENCH: 'geometry_msgs/msg/WrenchStamped'}
 #: What the node sends, name -> type; recorded with its inputs.
 OUTPUT_TYPES: Mapping[str, str] = {
     'progress': 'diagnostic_msgs/msg/DiagnosticArray',
@@ -33,7 +36,7 @@ OUTPUT_TYPES: Mapping[str, str] = {
     'markers': 'visualization_msgs/msg/MarkerArray',
 }
 
-RANKS = {INITIAL: 0, ACTION: 1, GOAL: 2}  # order of messages with equal stamps
+RANKS = {INITIAL: 0, ACTION: 1, GOAL: 2, WRENCH: 3}  # order of messages with equal stamps
 Key = tuple[int, int, tuple[str, ...]]  # by which messages are sorted; each collected message has its own
 
 NANOSECONDS = 10**9  # in a second
@@ -139,21 +142,60 @@ class ActionMessage:
         return self.stamp, RANKS[ACTION], self.names
 
 
-Message = Union[ChainMessage, ActionMessage]
+@dataclass(frozen=True)
+class WrenchMessage:
+    """
+    What the force sensor of a hand measured.
+
+    :param stamp: [ns], > 0.
+    :param frame_id: name of the hand.
+    :param force: (3,) [N] in the axes of the hand.
+    """
+
+    stamp: int
+    frame_id: str
+    force: Floats
+
+    kind: ClassVar[str] = WRENCH
+
+    def __post_init__(self) -> None:
+        _check_stamp(WRENCH, self.stamp)
+        force = frozen_array(self.force)
+        if not self.frame_id:
+            raise InputError(str(self), 'an empty frame_id', 'the name of a hand, as in joint_names',
+                             'let frame_id name the hand')
+        if not (np.abs(force) <= LARGEST_FORCE).all():  # NaN is not
+            came = ' '.join(f'{value:g}' for value in force)
+            raise InputError(f'{self} of {self.frame_id!r}', f'a force of {came} N',
+                             f'finite numbers up to {LARGEST_FORCE:g} N', 'leave it out')
+        object.__setattr__(self, 'force', force)
+
+    def __str__(self) -> str:
+        return named(WRENCH, self.stamp)
+
+    @cached_property
+    def key(self) -> Key:
+        """Its place in the order of messages."""
+        return self.stamp, RANKS[WRENCH], (self.frame_id,)
 
 
-def repeats(message: Message, other: Message) -> bool:
+Message = Union[ChainMessage, ActionMessage]  # of trials
+InputMessage = Union[Message, WrenchMessage]
+
+
+def repeats(message: InputMessage, other: InputMessage) -> bool:
     """Return whether two messages of one kind and stamp have the same content."""
-    here, there = (each.positions if isinstance(each, ActionMessage) else each.chain.observed
+    here, there = (each.positions if isinstance(each, ActionMessage) else
+                   each.force if isinstance(each, WrenchMessage) else each.chain.observed
                    for each in (message, other))
     return bool(np.array_equal(here, there, equal_nan=True))
 
 
-def read(kind: str, message: Any) -> Message:
+def read(kind: str, message: Any) -> InputMessage:
     """
     Read a message of an input topic.
 
-    :param kind: INITIAL, ACTION or GOAL.
+    :param kind: INITIAL, ACTION, GOAL or WRENCH.
     :param message: an rclpy or `rosbags` object, or anything with the same attributes.
     :raises InputError: where the message is invalid; the text names it.
     """
@@ -161,6 +203,10 @@ def read(kind: str, message: Any) -> Message:
     _check_stamp(kind, stamp)
     if kind == ACTION:
         return _read_action(message, stamp)
+    if kind == WRENCH:
+        force = message.wrench.force
+        return WrenchMessage(stamp, message.header.frame_id,
+                             np.array([force.x, force.y, force.z], dtype=float))
     return _read_chain(kind, message, stamp)
 
 
@@ -306,8 +352,15 @@ def bag_types() -> MessageTypes:
                         lambda octets: np.frombuffer(octets, np.uint8), int)
 
 
-def built(types: MessageTypes, message: Message) -> Any:
+def built(types: MessageTypes, message: InputMessage) -> Any:
     """Build the message of an input topic."""
+    if isinstance(message, WrenchMessage):
+        vectors = ({axis: float(value) for axis, value in zip(COORDINATES, values, strict=True)}
+                   for values in (message.force.tolist(), np.zeros(3)))
+        force, torque = (types.build('geometry_msgs/msg/Vector3', **vector) for vector in vectors)
+        wrench = types.build('geometry_msgs/msg/Wrench', force=force, torque=torque)
+        return types.build('geometry_msgs/msg/WrenchStamped', wrench=wrench,
+                           header=types.header(message.stamp, message.frame_id))
     return action_trajectory(types, message) if isinstance(message, ActionMessage) else \
         chain_cloud(types, message.chain, message.stamp, message.frame_id)
 

@@ -23,6 +23,8 @@ does not order different topics, and a robot may publish an action only when it 
   compared at that instant; any other with the DLO when it has come to rest.
 - A goal chain stamped before the first action of its trial waits unused, as
   that action may still arrive.
+- Wrenches belong to no trial: each goal takes those that its hands measured then,
+  see `wrenches`.
 
 A message that does not fit those with earlier stamps is refused, but stored: it is used
 if a late message with an earlier stamp makes it fit.  Actions and goal chains before the
@@ -48,8 +50,21 @@ from typing import Iterator, Sequence
 from dlo_calibration.calibration.choice import hand_warnings
 from dlo_calibration.calibration.options import names_of, OBSERVATION, Options
 from dlo_calibration.errors import InputError
-from dlo_calibration.messages.codec import ACTION, ActionMessage, GOAL, INITIAL, Key, Message, NANOSECONDS
+from dlo_calibration.messages.codec import (
+    ACTION,
+    ActionMessage,
+    GOAL,
+    INITIAL,
+    InputMessage,
+    Key,
+    Message,
+    NANOSECONDS,
+    WRENCH,
+    WrenchMessage,
+)
 from dlo_calibration.messages.trial_builder import TrialBuilder
+from dlo_calibration.messages.wrenches import force_problems, same_forces, with_forces, Wrenches
+from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.named_actions import Manipulation
 from dlo_calibration.model.pose import Pose
 from dlo_calibration.model.trial import Trial
@@ -88,6 +103,9 @@ class TrialCollector:
         self._new_refusals: list[InputError] = []
         self._warnings: list[str] = []
         self._early: list[str] = []
+        self._wrenches = Wrenches()
+        self._with_forces: dict[str, tuple[Trial, Trial]] = {}  # by name: without forces, and with them
+        self._forces_reported: set[str] = set()
         self._hands_seen = False  # whether a warning was given about errors of all hands
 
     def with_options(self, options: Options) -> tuple[TrialCollector, Iterator[int]]:
@@ -100,6 +118,7 @@ class TrialCollector:
         if all(getattr(options, name) == getattr(self._options, name) for name in USED):
             return self, iter(())
         other = TrialCollector(options)
+        other._wrenches, other._forces_reported = self._wrenches, self._forces_reported
         return other, self._filling(other)
 
     def _filling(self, other: TrialCollector) -> Iterator[int]:
@@ -118,12 +137,15 @@ class TrialCollector:
         for begin, end in self._forgotten:
             other._close(begin, end)
 
-    def add(self, message: Message) -> None:
+    def add(self, message: InputMessage) -> None:
         """
         Add one message, of any stamp.
 
         :raises InputError: where the message is refused; the trials do not change.
         """
+        if isinstance(message, WrenchMessage):
+            self._wrenches.add(message)
+            return
         key = message.key
         self._check(message)
         place = self._place(key)
@@ -239,7 +261,23 @@ class TrialCollector:
         trials = tuple(builder.build(f'trial {k}') for k, builder in enumerate(complete, start=1))
         for place in range(1, len(self._builders)):
             self._inspect(place)  # of chains that came late, each was not
-        return trials
+        tares: dict[str, Floats] = {}
+        return tuple(self._measured(trial, builder.zero, tares)
+                     for trial, builder in zip(trials, complete, strict=True)) if self._wrenches else trials
+
+    def _measured(self, trial: Trial, zero: int, tares: dict[str, Floats]) -> Trial:
+        """Return a trial with its forces; the same object until one changes."""
+        forces = self._wrenches.forces(trial, zero, tares)
+        before, after = self._with_forces.get(trial.name, (None, trial))
+        if before is not trial or not same_forces(forces, [goal.forces for goal in after.goals]):
+            after = with_forces(trial, forces) if any(forces) else trial
+            self._with_forces[trial.name] = trial, after
+        return after
+
+    @property
+    def force_problems(self) -> tuple[InputError, ...]:
+        """Why wrenches are not used, if some are not."""
+        return force_problems(self._wrenches, self.trials) if self._wrenches else ()
 
     def manipulations(self) -> tuple[tuple[Manipulation, ...], tuple[InputError, ...]]:
         """
@@ -470,11 +508,11 @@ class StampOrder:
         """The newest stamp [ns]; 0 before the first message."""
         return self._latest[0]
 
-    def clock_went_back(self, message: Message) -> bool:
+    def clock_went_back(self, message: InputMessage) -> bool:
         """Return whether the clock went back before this message."""
         return message.kind == INITIAL and message.frame_id == self._frame and self._goes_back(message)
 
-    def left_over(self, message: Message) -> bool:
+    def left_over(self, message: InputMessage) -> bool:
         """
         Return whether this message was stamped before the clock went back, and was under way then.
 
@@ -483,13 +521,13 @@ class StampOrder:
         return (message.kind in self._former_newest and message.stamp > self._former_newest[message.kind]
                 and abs(message.stamp - self._former_end) <= MARGIN and message.stamp > self.newest + MARGIN)
 
-    def check(self, message: Message) -> None:
+    def check(self, message: InputMessage) -> None:
         """
         Check that a message certainly belongs to the trials of the present clock.
 
         :raises InputError: if it does not.
         """
-        if message.frame_id != self._frame:
+        if message.kind == WRENCH or message.frame_id != self._frame:
             return  # the collector refuses it
         # What is stamped before all trials can be used by none; the collector refuses it.
         if message.kind != INITIAL and message.stamp > self._first and self._goes_back(message):
@@ -500,12 +538,14 @@ class StampOrder:
                 'the order of stamps on each topic',
                 'stamp all messages with one clock, and send an initial_chain first after it went back')
 
-    def _goes_back(self, message: Message) -> bool:
+    def _goes_back(self, message: InputMessage) -> bool:
         return (message.stamp < self._newest.get(message.kind, 0) - MARGIN
                 and message.stamp < self._newest.get(INITIAL, 0) and message.stamp < self._latest[-1])
 
-    def add(self, message: Message) -> None:
+    def add(self, message: InputMessage) -> None:
         """Add a message that `check` does not refuse; one in another frame than the first is ignored."""
+        if message.kind == WRENCH:
+            return
         self._frame = self._frame or message.frame_id
         if message.frame_id != self._frame:
             return

@@ -12,7 +12,17 @@ from typing import Sequence
 import numpy as np
 
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.messages.codec import ActionMessage, ChainMessage, GOAL, INITIAL, Message, NANOSECONDS
+from dlo_calibration.messages.codec import (
+    ActionMessage,
+    ChainMessage,
+    GOAL,
+    INITIAL,
+    InputMessage,
+    Message,
+    NANOSECONDS,
+    WrenchMessage,
+)
+from dlo_calibration.messages.wrenches import axes, EMPTY
 from dlo_calibration.model.action import Hand
 from dlo_calibration.model.chain import Chain, Floats, MINIMUM_SPACING
 from dlo_calibration.model.trial import Goal, Trial
@@ -22,17 +32,18 @@ SAME_OFFSET = 1e-3  # of a segment
 BEFORE = NANOSECONDS // 100  # time between the two initial chains that give a velocity
 
 
-def trial_messages(trials: Sequence[Trial], frame_id: str) -> list[Message]:
+def trial_messages(trials: Sequence[Trial], frame_id: str) -> list[InputMessage]:
     """
     Return messages from which a `TrialCollector` makes the same trials, to a nanosecond.
 
     A hand that keeps holding the DLO during a later action takes part in it, at rest.
+    Forces are those of hands that do not turn, at goals 0.05 s apart.
     Three cases cannot be sent, and are lost: two hands that grip one point of a chain; a hand
     that closes far from its point in the latest chain, if other hands act alone between that
     chain and its action; and a hand that holds the DLO in a goal, but still moved when
     another hand's last action began.
     """
-    messages: list[Message] = []
+    messages: list[InputMessage] = []
     zero = 1_700_000_000 * NANOSECONDS  # a time in 2023, as real stamps are
     for trial in trials:
         messages += _messages(trial, frame_id, zero)
@@ -59,12 +70,12 @@ def episode_messages(cut: Sequence[Episode], frame_id: str, zero: int) -> list[M
     return messages
 
 
-def _messages(trial: Trial, frame_id: str, zero: int) -> list[Message]:
+def _messages(trial: Trial, frame_id: str, zero: int) -> list[InputMessage]:
     def at(time: float) -> int:
         return zero + round(time * NANOSECONDS)
 
     groups, initial = _numbered(trial, _groups(trial))
-    messages: list[Message] = []
+    messages: list[InputMessage] = []
     if trial.velocity is None:
         messages.append(ChainMessage(INITIAL, zero - BEFORE, frame_id, initial))
     else:
@@ -75,6 +86,12 @@ def _messages(trial: Trial, frame_id: str, zero: int) -> list[Message]:
         messages.append(action_message(hands, at(min(hand.start for hand in hands)), frame_id))
     for goal in trial.goals:
         messages.append(ChainMessage(GOAL, at(goal.time), frame_id, _annotated_goal(trial, goal, groups)))
+    closed = {hand.name: hand for hand in reversed(trial.hands)}
+    for name in {hand.name for _, hand, force in trial.forces if force.tared}:
+        messages.append(WrenchMessage(at(closed[name].start + sum(EMPTY) / 2), name, np.zeros(3)))
+    for k, hand, force in trial.forces:
+        time = trial.goals[k].time
+        messages.append(WrenchMessage(at(time), hand.name, force.vector @ axes(hand, time)))
     return sorted(messages, key=lambda message: message.key)
 
 

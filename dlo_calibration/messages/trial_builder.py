@@ -82,6 +82,7 @@ class TrialBuilder(CheckedMessages):
     The first builder of a collector has no initial chain: it holds the messages before the first one.
 
     :ivar trial: None from a change until it is built again.
+    :ivar zero: stamp of its time 0 [ns], once it is built.
     :ivar warned: whether a warning was given that the trial is implausible.
     :ivar lost: whether a warning was given about a hand that has lost the DLO.
     """
@@ -89,6 +90,7 @@ class TrialBuilder(CheckedMessages):
     def __init__(self, first: Key, options: Options, until: Key | None = None) -> None:
         super().__init__(first, options, until)
         self.trial: Trial | None = None
+        self.zero = 0
         self._phases: list[Phase] = []
         self._affordable = 0  # goal chains that may be added to phases only to look for warnings
         self._inspected = 0, False  # see `due`
@@ -127,6 +129,7 @@ class TrialBuilder(CheckedMessages):
             start, velocity = self.starts[-1], self._velocity()
             zero = start.stamp if velocity is not None else min(
                 goals[0].stamp, *(action.stamps[0] for action in self.actions))
+            self.zero = zero
             actions = tuple(action.action(zero) for action in self.actions)
             self.trial = Trial(name, start.chain, actions, tuple(
                 goal for phase in self._all_phases() for goal in phase.trial_goals(zero)), velocity)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import Any, Self, Sequence
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from dlo_calibration.errors import InputError
 from dlo_calibration.model.action import Action, far_from_unit, Hand, quaternion_lengths, rotation_matrix
 from dlo_calibration.model.chain import Chain, check_size, Floats, frozen_array
 from dlo_calibration.model.named_actions import NamedAction
-from dlo_calibration.model.trial import Trial
+from dlo_calibration.model.trial import Force, Trial
 
 NUMBERS = 'x y z qx qy qz qw'
 
@@ -89,11 +89,16 @@ class Pose:
         """Return a chain of the frame in the other one."""
         return replace(chain, points=self.points(chain.points))
 
+    def forces(self, forces: Sequence[Force]) -> tuple[Force, ...]:
+        """Return forces of the frame in the other one."""
+        return tuple(replace(force, vector=self.vectors(force.vector)) for force in forces)
+
     def trial(self, trial: Trial) -> Trial:
         """Return a trial of the frame in the other one."""
         return replace(
             trial, initial=self.chain(trial.initial), actions=tuple(map(self.action, trial.actions)),
-            goals=tuple(replace(goal, chain=self.chain(goal.chain)) for goal in trial.goals),
+            goals=tuple(replace(goal, chain=self.chain(goal.chain), forces=self.forces(goal.forces))
+                        for goal in trial.goals),
             velocity=None if trial.velocity is None else self.vectors(trial.velocity))
 
     def action(self, action: Action) -> Action:

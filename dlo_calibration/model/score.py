@@ -138,6 +138,31 @@ def residuals(trial: Trial, chains: Floats) -> Floats:
     return differences(trial, chains)[seen_points(trial)].ravel()
 
 
+def force_residuals(trial: Trial, forces: Floats) -> Floats:
+    """
+    Return simulated minus measured forces, (3 f,) [m] by the `force_scale`, in the order of `Trial.forces`.
+
+    :param forces: (f, 3) [N] simulated.
+    """
+    if not trial.forces:
+        return np.zeros(0)
+    off = without_offsets(trial, forces - np.stack([force.vector for _, _, force in trial.forces]))
+    return np.asarray((off * trial.force_scale).ravel())
+
+
+def without_offsets(trial: Trial, forces: Floats) -> Floats:
+    """
+    Return forces, (f, 3) [N] in the order of `Trial.forces`, without unknown offsets of sensors.
+
+    Those of a hand whose sensor has an unknown offset have no mean over the trial.
+    """
+    forces = forces.copy()
+    for name in {hand.name for _, hand, force in trial.forces if not force.tared}:
+        rows = [k for k, (_, hand, _) in enumerate(trial.forces) if hand.name == name]
+        forces[rows] -= forces[rows].mean(axis=0)
+    return forces
+
+
 def distances(residual: Floats) -> Floats:
     """Return the distances of simulated from observed points, (p,) [m], of a residual vector, (3 p,) [m]."""
     return np.asarray(np.linalg.norm(residual.reshape(-1, 3), axis=1))

@@ -21,6 +21,32 @@ from dlo_calibration.model.chain import Chain, check_ends, Floats, frozen_array
 VIEWS = 25  # largest number of goals that estimate the places of unseen points of an initial chain
 
 
+LARGEST_FORCE = 1e6  # N; larger ones are errors
+
+
+@dataclass(frozen=True, eq=False)
+class Force:
+    """
+    A measured force that the DLO exerts on a hand; that of a rope hanging from the hand points down.
+
+    :param hand: its name.
+    :param vector: (3,) [N] in the frame of the chains.
+    :param tared: whether it is 0 where the hand holds nothing. If not, the sensor has an unknown offset, the
+        same in the whole trial, and only differences between goals count.
+    """
+
+    hand: str
+    vector: Floats
+    tared: bool = True
+
+    def __post_init__(self) -> None:
+        vector = frozen_array(self.vector)
+        if vector.shape != (3,) or not (np.abs(vector) <= LARGEST_FORCE).all():  # neither is NaN
+            raise InputError(f'force on hand {self.hand!r}', ' '.join(f'{x:g}' for x in vector.ravel()[:4]),
+                             f'three finite numbers up to {LARGEST_FORCE:g} N', 'give x, y and z in N')
+        object.__setattr__(self, 'vector', vector)
+
+
 @dataclass(frozen=True)
 class Goal:
     """
@@ -32,6 +58,7 @@ class Goal:
         after `time`; False: it is compared at that instant.
     :param held_by: names of the hands that still hold the DLO in this goal.
     :param count: number of chains of which `chain` is the mean: its noise is that much lower.
+    :param forces: measured on hands that hold the DLO then, at most one for each.
     """
 
     chain: Chain
@@ -39,6 +66,7 @@ class Goal:
     stable: bool = True
     held_by: tuple[str, ...] = ()
     count: int = 1
+    forces: tuple[Force, ...] = ()
 
     def __post_init__(self) -> None:
         if not abs(self.time) <= MAXIMUM_TIME:
@@ -59,6 +87,8 @@ class Trial:
     :param places: (n,) [m] arc lengths of the points at rest, from 0; None: those of the initial chain.
     :param session: number of the session, from 1; sessions may have parameters of their own.
     :param loads: whether a simulation shall measure the loads of the DLO on its way, which takes time.
+    :param force_scale: in x, y and z, how far a point must be off to count as much as a force that is off by
+        1 N [m/N]; a calibration estimates it.
     """
 
     name: str
@@ -69,6 +99,7 @@ class Trial:
     places: Floats | None = None
     loads: bool = False
     session: int = 1
+    force_scale: tuple[float, float, float] = (0.05, 0.05, 0.05)
 
     def __post_init__(self) -> None:
         thing = f'trial {self.name!r}'
@@ -93,6 +124,15 @@ class Trial:
                                  'a goal after its last waypoint', 'make it a timed goal')
         check_grips(thing, hands, n)
         check_ends(thing, self.initial)
+        for k, goal in enumerate(goals):
+            names = [force.hand for force in goal.forces]
+            holding = [hand.name for hand in self.holding(goal)] if names else []
+            for name in names:
+                if name not in holding or names.count(name) > 1:
+                    raise InputError(
+                        thing, f'a force on {name!r} in goal {k + 1}' + ' twice' * (names.count(name) > 1),
+                        f'one for each hand that holds the DLO then ({", ".join(holding) or "none"})',
+                        'correct the name of the hand, or leave the force out')
         object.__setattr__(self, 'actions', actions)
         object.__setattr__(self, 'goals', goals)
         if not self.initial.seen.all():
@@ -121,6 +161,12 @@ class Trial:
         """All hands of all actions, in the order of their start."""
         return tuple(sorted((hand for action in self.actions for hand in action.hands),
                             key=lambda hand: hand.start))
+
+    @cached_property
+    def forces(self) -> tuple[tuple[int, Hand, Force], ...]:
+        """The measured forces, goal by goal: index of the goal, the hand, and the force on it."""
+        return tuple((k, hand, force) for k, goal in enumerate(self.goals) for force in goal.forces
+                     for hand in self.holding(goal) if hand.name == force.hand)
 
     @property
     def clamped(self) -> tuple[int, ...]:

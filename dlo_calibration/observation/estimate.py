@@ -289,11 +289,31 @@ def prior_estimates(trials: Sequence[Trial], space: ParameterSpace,
     load, stretch, hold = _resting(trials, table_height, sigma)
     estimates = {'friction': _friction(load, hold),
                  'self_collision': _self_collision(trials, table_height, sigma)}
-    if 'mass' not in space.free:  # chains at rest show stiffness only in proportion to weight
-        weight = space.physical({}, length)['mass'] / length * GRAVITY
+    mass = borne_mass(trials)
+    if math.isfinite(mass):
+        estimates['mass'] = _on_scale('mass', mass, 0.8 * mass, BY_NAME['mass'].at_hundred)
+    if 'mass' not in space.free or math.isfinite(mass):  # chains show only stiffness / weight
+        weight = (mass if 'mass' in space.free else space.physical({}, length)['mass']) / length * GRAVITY
         estimates['flexibility'] = _flexibility(load, hold, weight)
         estimates['elasticity'] = _elasticity(stretch, weight)
     return {name: estimates.get(owner(name)[0], UNKNOWN) for name in space.free}
+
+
+def borne_mass(trials: Sequence[Trial]) -> float:
+    """
+    Return the largest mass whose weight the hands bore in a goal [kg], by measured forces; nan: none did.
+
+    It is that of the DLO where the table bears nothing; differences of forces of an unknown offset bound it.
+    """
+    weights = []
+    for trial in trials:
+        for tared in (True, False):
+            downward = np.zeros(len(trial.goals))
+            for k, _, force in trial.forces:
+                downward[k] -= force.vector[2] if force.tared == tared else 0.0
+            weights.append(float(downward.max() if tared else np.ptp(downward)))
+    heaviest = max(weights, default=0.0)
+    return heaviest / GRAVITY if heaviest > 0 else float('nan')
 
 
 def start_point(trials: Sequence[Trial], space: ParameterSpace, table_height: float | None) -> Floats:

@@ -99,7 +99,8 @@ def excites(trials: Sequence[Trial], space: ParameterSpace, table_height: float 
             'elasticity': _may_stretch(trial, space, sigma),
             'damping': any(not goal.stable for goal in trial.goals),
             'internal_damping': any(not goal.stable for goal in trial.goals),
-            'mass': not all(p.per_weight <= (p.name in space.free) for p in BY_NAME.values())}
+            'mass': bool(trial.forces) or not all(
+                p.per_weight <= (p.name in space.free) for p in BY_NAME.values())}
         rows.append([shown.get(owner(name)[0], True) and space.holds_in(name, trial.session)
                      for name in space.free])
     return frozen_array(np.reshape(rows, (len(trials), space.dimension)), bool)

@@ -33,6 +33,8 @@ LONGEST_STEP = 0.025  # of the time in which a DLO swings; beyond, released ones
 SIGMAS = 5.0  # standard deviations that noise never exceeds
 STEEPEST = math.radians(15.0)  # of the plane in which a DLO lies; table poses are more exact
 BESIDE = math.radians(60.0)  # of a centre of mass from straight below the hands that hold a DLO
+IN_THE_AIR = 0.05  # m above the table; a lower hand may press a DLO on it
+FELT = 0.05  # N; smaller mean forces are noise
 LEVER = 0.1  # of the length; the direction of a shorter lever is uncertain
 NOISY = 0.005  # of the length; trackers and photographs are twice as good
 SUNK = 0.002  # m; a middle line is not further below the top of the table
@@ -118,7 +120,20 @@ def implausible(trial: Trial, table_height: float | None, scene: bool = False,
         if problem is not None:
             warnings.append(str(InputError(trial.name, f'{description} {problem[0]}', *problem[1:])))
             break  # the warnings about the others would be the same
-    return tuple(warnings)
+    return (*warnings, *_upwards(trial, table_height, scene))
+
+
+def _upwards(trial: Trial, table_height: float | None, scene: bool) -> tuple[str, ...]:
+    """Return a warning about forces that push up hands from which a DLO hangs."""
+    lowest = -math.inf if table_height is None else table_height + IN_THE_AIR
+    up = [float(force.vector[2]) for k, hand, force in trial.forces if force.tared and trial.goals[k].stable
+          and hand.positions[-1, 2] > lowest]
+    if scene or not up or np.mean(up) < FELT:
+        return ()
+    return str(InputError(
+        trial.name, f'forces that push the hands up by {measured(float(np.mean(up)), "N")}, though '
+        'a DLO hangs from them', 'the force that the DLO exerts on a hand, which points down there',
+        'reverse the sign of the forces, or tell how the hands are turned')),
 
 
 def _at_rest(trial: Trial) -> list[tuple[str, Chain, Sequence[Hand]]]:

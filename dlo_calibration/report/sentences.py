@@ -42,8 +42,8 @@ MOST_COMBINATIONS = 3  # of parameters that the trials do not determine, in sent
 def sentences(result: CalibrationResult) -> list[str]:
     """Return sentences on the parameters and their uncertainty, the next action, and how well the fit is."""
     return [*_parameters(result), *rest_shape_sentences(result), *friction_sentences(result),
-            *(pair.words for pair in result.together), *_advice(result), *_uninformative(result),
-            *_fit(result), *_missing_parameters(result), *_undetermined(result)]
+            *_forces(result), *(pair.words for pair in result.together), *_advice(result),
+            *_uninformative(result), *_fit(result), *_missing_parameters(result), *_undetermined(result)]
 
 
 def _parameters(result: CalibrationResult) -> list[str]:
@@ -78,6 +78,26 @@ def _parameters(result: CalibrationResult) -> list[str]:
         texts.append('The search has not reached a minimum, so that the intervals are only the spread of the '
                      'best parameter sets that it tried; more evaluations or another search may narrow them.')
     return texts
+
+
+def _forces(result: CalibrationResult) -> list[str]:
+    """Return a sentence on what measured forces told."""
+    forces = [force for trial in result.trials for *_, force in trial.forces]
+    if not forces:
+        return []
+    words = (f'{len(forces)} measured force{"s" * (len(forces) > 1)} on hands are '
+             f'{", ".join(map(number, result.force_error))} N from the simulated ones in x, y and z')
+    untared = sum(not force.tared for force in forces)
+    if untared:
+        words += (f'; the offset of {"their" if untared == len(forces) else "some"} sensors is unknown, so '
+                  'that only differences within a trial count')
+    mass = result.parameters.get('mass')
+    if mass is None:
+        return [f'{words}.']
+    if mass.verdict == NOT_IDENTIFIABLE:
+        return [f'{words}; they do not tell the mass: let a hand rest for a second before it closes, so that '
+                'its sensor shows the offset, and lift more of the DLO.']
+    return [f'{words}; they tell the mass, and so stiffnesses absolutely, not only relative to the weight.']
 
 
 def _undetermined(result: CalibrationResult) -> list[str]:

@@ -192,6 +192,7 @@ def print_info(about: Mapping[str, Any], stream: TextIO) -> None:
                  (f"mean of {trial['averaged_chains']} chains at rest", trial['averaged_chains']),
                  ('annotated hands', trial['annotated_hands']),
                  (f"{trial['annotated_features']} annotated features", trial['annotated_features']),
+                 (f"{trial['forces']} forces", trial['forces']),
                  (f"unseen points: {trial['unseen_points']}", trial['unseen_points'])) if there) or '-')
             for trial in about['trials']], head))
     for title in ('refusals', 'problems', 'notes'):

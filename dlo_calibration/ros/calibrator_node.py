@@ -25,7 +25,7 @@ from std_srvs.srv import Trigger
 from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.errors import InputError
-from dlo_calibration.messages.codec import INPUT_TYPES, OUTPUT_TYPES
+from dlo_calibration.messages.codec import INPUT_TYPES, OUTPUT_TYPES, WRENCH
 from dlo_calibration.messages.collector import MARGIN
 from dlo_calibration.model.pose import NUMBERS, Pose
 from dlo_calibration.ros.graph_node import GraphNode, SLICE
@@ -80,8 +80,8 @@ class Inbox:
 
     @property
     def first(self) -> tuple[str, bytes | None]:
-        """What `take` would return; ('', None) if nothing waits."""
-        return self._waiting[0] if self._waiting else ('', None)
+        """The oldest message with the frame of the chains, or request; ('', None) if none waits."""
+        return next((item for item in self._waiting if item[0] != WRENCH), ('', None))
 
     def drop(self, kind: str, count: int) -> None:
         """Count messages that were dropped."""

@@ -80,6 +80,8 @@ def _pairs(values: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:
             key, value = f'{key}m', None if value is None else value * 1e3
         if key in ('warnings', 'undetermined'):
             value = '; '.join(value)
+        if key == 'force_error_n' and value is not None:
+            value = ' '.join(map(repr, value))
         if key == 'together':
             value = ' '.join(pair['words'] for pair in value)
         pairs[f'{prefix}{key}'] = '' if value is None else value

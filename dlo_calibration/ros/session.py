@@ -34,11 +34,14 @@ from dlo_calibration.messages.codec import (
     GOAL,
     INITIAL,
     INPUT_TYPES,
+    InputMessage,
     Message,
     MessageTypes,
     NANOSECONDS,
     OUTPUT_TYPES,
     read,
+    WRENCH,
+    WrenchMessage,
 )
 from dlo_calibration.messages.collector import KEPT, StampOrder, TrialCollector, went_back
 from dlo_calibration.messages.encoder import action_message
@@ -329,6 +332,10 @@ class CalibrationSession(NodeSession[CalibratorOptions]):
                         'it belongs to the former session')
             return
         self._recorder.message(self._graph.topic(kind), INPUT_TYPES[kind], octets, flush)
+        if kind == WRENCH or isinstance(message, WrenchMessage):  # a sensor goes on all the time
+            if refusal := refusal if message is None else self._collect(message):
+                self.refuse(refusal)
+            return
         if kind != INITIAL:
             self._state.heard = self._clock()
             self._state.markers.wanted = self._state.renewal.wanted = True
@@ -401,14 +408,14 @@ class CalibrationSession(NodeSession[CalibratorOptions]):
 
     # Messages of the robot
 
-    def _read(self, kind: str, octets: bytes) -> tuple[Message | None, str]:
+    def _read(self, kind: str, octets: bytes) -> tuple[InputMessage | None, str]:
         """Return a message, or None and why it cannot be read."""
         try:
             return read(kind, self._decoded(kind, octets)), ''
         except Exception as error:  # a defect of this package must not end the session
             return None, refusal_text(error, kind)
 
-    def _collect(self, message: Message) -> str:
+    def _collect(self, message: InputMessage) -> str:
         """Collect a message; return why it is refused, if it is."""
         try:
             self._order.check(message)
@@ -455,7 +462,7 @@ class CalibrationSession(NodeSession[CalibratorOptions]):
         self._graph.hear_waiting()  # messages sent before the request belong to this calibration
         options = self._take_options()
         reported = set(self._state.refusals)
-        for refusal in map(str, self._collector.refusals):
+        for refusal in map(str, (*self._collector.refusals, *self._collector.force_problems)):
             if refusal not in reported:
                 self.refuse(refusal)
         trials = self._collector.trials

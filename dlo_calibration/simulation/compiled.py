@@ -10,6 +10,8 @@ from dataclasses import dataclass
 import threading
 from typing import Any, Mapping, Self, Sequence, TYPE_CHECKING
 
+import numpy as np
+
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.table import resting_level
@@ -121,9 +123,12 @@ class Engine:
         """
         if outcome is None:
             raise SimulationError('the rollout diverged: the chain is no longer finite')
-        nodes, settled, steps, measured = outcome
+        nodes, settled, steps, measured, holding = outcome
         loads = Loads.measured(measured, prepared.layout.places) if measured is not None else None
-        return Rollout(prepared.layout.observe @ nodes, settled, steps * self._time_step, steps, loads)
+        forces = [-holding[k, list(prepared.layout.nodes(hand))].sum(axis=0)
+                  for k, hand, _ in prepared.trial.forces]
+        return Rollout(prepared.layout.observe @ nodes, settled, steps * self._time_step, steps, loads,
+                       np.reshape(forces, (-1, 3)))
 
     def refined(self) -> Self:
         """Return an engine with twice the segments and half the time step."""

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from concurrent.futures import CancelledError
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Mapping, Protocol, runtime_checkable, Sequence
 
 import numpy as np
@@ -34,7 +34,8 @@ class Rollout:
     :param steps: number of time steps.
     :param loads: the largest ones up to each of the g goals, since the goal before; None if the trial does
         not ask for them, or the engine does not know them.
-    :raises SimulationError: if a point is not finite.
+    :param forces: (f, 3) [N] that the DLO exerts on hands, in the order of `Trial.forces`.
+    :raises SimulationError: if a point or a force is not finite.
     """
 
     chains: Floats
@@ -42,12 +43,14 @@ class Rollout:
     duration: float
     steps: int
     loads: Loads | None = None
+    forces: Floats = field(default_factory=lambda: np.zeros((0, 3)))
 
     def __post_init__(self) -> None:
-        chains = frozen_array(self.chains)
-        if not np.isfinite(chains).all():
-            raise SimulationError('the rollout diverged: a simulated point is not finite')
-        object.__setattr__(self, 'chains', chains)
+        for name, of in (('chains', 'point'), ('forces', 'force')):
+            values = frozen_array(getattr(self, name))
+            if not np.isfinite(values).all():
+                raise SimulationError(f'the rollout diverged: a simulated {of} is not finite')
+            object.__setattr__(self, name, values)
 
 
 Job = tuple[Trial, Mapping[str, float]]  # a trial, and physical parameters by name (SI units)

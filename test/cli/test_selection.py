@@ -19,7 +19,7 @@ from dlo_calibration.files.recording import SessionWriter
 from dlo_calibration.files.request import GoalRequest, Request, TrialRequest, write_request
 from dlo_calibration.files.result import read_result
 from dlo_calibration.files.session import read_session
-from dlo_calibration.messages.codec import ACTION, bag_types, GOAL, INITIAL, INPUT_TYPES
+from dlo_calibration.messages.codec import ACTION, bag_types, GOAL, INITIAL, TRIAL_TYPES
 
 pytestmark = pytest.mark.usefixtures('without_drawings', 'without_slices')
 
@@ -34,7 +34,7 @@ def recorded(path, names, count=3):
     hello = TYPES.build('std_msgs/msg/String', data='hello')
     with SessionWriter(path) as writer:
         for k, (kind, message) in enumerate(session_messages(TYPES, count)):
-            writer.write(names[kind], INPUT_TYPES[kind], encode(message, INPUT_TYPES[kind]), (k + 1) * MINUTE)
+            writer.write(names[kind], TRIAL_TYPES[kind], encode(message, TRIAL_TYPES[kind]), (k + 1) * MINUTE)
         writer.write('/chatter', 'std_msgs/msg/String', encode(hello, 'std_msgs/msg/String'), MINUTE)
         return writer.path
 
@@ -42,7 +42,7 @@ def recorded(path, names, count=3):
 @pytest.fixture
 def session(tmp_path):
     """Give a session of three trials."""
-    return recorded(tmp_path / 'session', {kind: f'/calibrator/{kind}' for kind in INPUT_TYPES})
+    return recorded(tmp_path / 'session', {kind: f'/calibrator/{kind}' for kind in TRIAL_TYPES})
 
 
 @pytest.fixture
@@ -140,7 +140,7 @@ def test_topics_with_other_names_are_read_and_written_with_ours(session, own, tm
 
 
 def test_a_remapped_topic_is_read_instead_of_one_of_that_name(tmp_path, act):
-    names = {kind: f'/calibrator/{kind}' for kind in INPUT_TYPES}
+    names = {kind: f'/calibrator/{kind}' for kind in TRIAL_TYPES}
     path = recorded(tmp_path / 'session', names, 1)
     wrong = {**names, INITIAL: '/calibrator/goal_chain', GOAL: '/tracker'}  # goals are elsewhere
     other = recorded(tmp_path / 'other', wrong, 1)
@@ -157,7 +157,7 @@ def test_info_names_the_topics_that_it_does_not_know_and_how_to_use_them(own, ac
     unknown = {entry['topic']: entry for entry in printed['unknown_topics']}
     assert {topic: (entry['type'], entry['messages']) for topic, entry in unknown.items()} == {
         '/chatter': ('std_msgs/msg/String', 1), **{
-            topic: (INPUT_TYPES[kind], 3) for kind, topic in OWN.items()}}
+            topic: (TRIAL_TYPES[kind], 3) for kind, topic in OWN.items()}}
     assert unknown['/chatter']['hint'] == ''
     assert '--remap /trackdlo/results_pc:=goal_chain' in unknown['/trackdlo/results_pc']['hint']
     assert '--remap /arm/done:=action' in unknown['/arm/done']['hint']

@@ -75,7 +75,7 @@ def test_every_topic_is_documented():
         assert f'~/{name}' in tracker
     calibrator = ''.join(text for heading, text in sections().items()
                          if heading not in ('The planner', 'The tracker'))
-    for name in ('initial_chain', 'action', 'goal_chain', *OUTPUT_TYPES,
+    for name in ('initial_chain', 'action', 'goal_chain', 'wrench', *OUTPUT_TYPES,
                  'start', 'stop', 'reset', 'discard_last'):
         assert f'~/{name}' in calibrator
 

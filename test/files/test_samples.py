@@ -21,7 +21,7 @@ from dlo_calibration.cli import main as cli
 from dlo_calibration.files.chain_file import read_chain_file
 from dlo_calibration.files.result import read_result
 from dlo_calibration.files.session import read_session
-from dlo_calibration.messages.codec import ACTION, bag_types, INPUT_TYPES, read
+from dlo_calibration.messages.codec import ACTION, bag_types, read, TRIAL_TYPES
 from dlo_calibration.messages.collector import TrialCollector
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.planning.options import PlanOptions
@@ -78,7 +78,7 @@ def sample_messages(types, load=loaded_by_ruamel):
     """Return the (kind, message object) of the YAML files, after a journey over the wire."""
     travel = wire(types)
     return [(kind, travel(filled(types, name, load(message_file(kind).read_text(encoding='utf-8')))))
-            for kind, name in INPUT_TYPES.items()]
+            for kind, name in TRIAL_TYPES.items()]
 
 
 def sample_trials(messages):
@@ -94,9 +94,9 @@ def test_every_file_is_used():
                for name in ('README.md', 'truth.json', 'first.jpg', 'second.jpg', 'third.jpg')}
     listed |= {SAMPLES / 'chains' / name for name in ('start.csv', 'goal.csv', 'hairpin.csv',
                                                    'around_posts.csv', 'posts.urdf')}
-    assert files(SAMPLES) == listed | {message_file(kind) for kind in INPUT_TYPES} | files(*SESSIONS)
+    assert files(SAMPLES) == listed | {message_file(kind) for kind in TRIAL_TYPES} | files(*SESSIONS)
     readme = (SAMPLES / 'README.md').read_text(encoding='utf-8')
-    for name in ('make_yaml.py', *(f'{kind}.yaml' for kind in INPUT_TYPES),
+    for name in ('make_yaml.py', *(f'{kind}.yaml' for kind in TRIAL_TYPES),
                  *(session.name for session in SESSIONS), 'photographs', 'chains'):
         assert name in readme
 
@@ -119,7 +119,7 @@ def test_yaml_messages_in_any_order_are_one_complete_trial(types, load):
 
 
 def test_yaml_messages_show_the_first_trial_of_object1(types):
-    whole = read_session(SAMPLES / 'object1').messages[:len(INPUT_TYPES)]
+    whole = read_session(SAMPLES / 'object1').messages[:len(TRIAL_TYPES)]
     for (kind, message), (expected_kind, expected) in zip(sample_messages(types), whole, strict=True):
         sample, original = read(kind, message), read(expected_kind, expected)
         assert (sample.kind, sample.stamp, sample.frame_id) == (
@@ -140,11 +140,11 @@ def test_yaml_messages_calibrate():
     assert result.best.score < 100
 
 
-@pytest.mark.parametrize('kind', INPUT_TYPES)
+@pytest.mark.parametrize('kind', TRIAL_TYPES)
 def test_yaml_file_begins_with_its_command_which_the_readme_has(kind):
     command = ' '.join(line.lstrip('# ').rstrip('\\ ') for line in
                        message_file(kind).read_text(encoding='utf-8').split('\n')[:2])
-    assert command == f'ros2 topic pub --once /calibrator/{kind} {INPUT_TYPES[kind]} ' \
+    assert command == f'ros2 topic pub --once /calibrator/{kind} {TRIAL_TYPES[kind]} ' \
         f'"$(cat msg_samples/{kind}.yaml)"'
     assert f'    {command}\n' in (SAMPLES / 'README.md').read_text(encoding='utf-8')
 
@@ -155,7 +155,7 @@ def test_script_writes_the_yaml_files(tmp_path):
     spec.loader.exec_module(script)
     assert script.main([str(SAMPLES / 'object1'), str(tmp_path)]) == 0
     assert {file.name: file.read_text() for file in tmp_path.iterdir()} == {
-        f'{kind}.yaml': message_file(kind).read_text() for kind in INPUT_TYPES}
+        f'{kind}.yaml': message_file(kind).read_text() for kind in TRIAL_TYPES}
 
 
 @pytest.mark.parametrize('folder', SESSIONS, ids=lambda folder: folder.name)
@@ -163,5 +163,5 @@ def test_session_is_complete(folder, capsys):
     assert cli.main(['info', str(folder), '--json']) == 0
     printed = json.loads(capsys.readouterr().out)
     assert len(printed['trials']) == 4
-    assert printed['messages'] == {f'/calibrator/{kind}': 4 for kind in INPUT_TYPES}
+    assert printed['messages'] == {f'/calibrator/{kind}': 4 for kind in TRIAL_TYPES}
     assert (printed['problems'], printed['refusals']) == ([], [])

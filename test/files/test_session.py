@@ -37,8 +37,8 @@ from dlo_calibration.messages.codec import (
     chain_cloud,
     GOAL,
     INITIAL,
-    INPUT_TYPES,
     read,
+    TRIAL_TYPES,
 )
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.parameters import BY_NAME
@@ -75,7 +75,7 @@ MESSAGES = [message for trial in range(3) for message in trial_messages(trial)]
 
 def write(writer, messages=MESSAGES, namespace='/calibrator', **rest):
     for kind, message, log_time in messages:
-        writer.write(f'{namespace}/{kind}', INPUT_TYPES[kind], encode(message, INPUT_TYPES[kind]),
+        writer.write(f'{namespace}/{kind}', TRIAL_TYPES[kind], encode(message, TRIAL_TYPES[kind]),
                      log_time, **rest)
 
 
@@ -115,7 +115,7 @@ def test_rosbags_reads_what_we_write(session, what):
     with Reader(session if what == 'folder' else mcap(session)) as reader:
         messages = list(reader.messages())
         assert {(c.topic, c.msgtype, c.msgcount) for c in reader.connections} == {
-            *((f'/calibrator/{kind}', name, 3) for kind, name in INPUT_TYPES.items()),
+            *((f'/calibrator/{kind}', name, 3) for kind, name in TRIAL_TYPES.items()),
             ('/calibrator/status', STATUS, 1)}
         assert (reader.start_time, reader.message_count) == (START, 10)
     assert [time for _, time, _ in messages[:-1]] == [time for _, _, time in MESSAGES]
@@ -139,7 +139,7 @@ def test_mcap_file_has_the_profile_schemas_and_metadata_of_rosbag2(session):
         assert reader.get_header().profile == 'ros2'
         inside = {record.name: record.metadata for record in reader.iter_metadata()}
     assert {(s.name, s.encoding) for s in summary.schemas.values()} == {
-        (name, 'ros2msg') for name in (*INPUT_TYPES.values(), STATUS)}
+        (name, 'ros2msg') for name in (*TRIAL_TYPES.values(), STATUS)}
     for channel in summary.channels.values():
         assert channel.message_encoding == 'cdr'
         assert YAML(typ='safe').load(channel.metadata['offered_qos_profiles'])[0]['reliability'] == 'reliable'
@@ -175,9 +175,9 @@ def test_bag_by_rosbags(tmp_path, storage, mode, version):
     writer.set_compression(mode, CompressionFormat.ZSTD)
     with writer:
         topics = {kind: writer.add_connection(f'/robot/{kind}', name, typestore=STORE)
-                  for kind, name in INPUT_TYPES.items()}
+                  for kind, name in TRIAL_TYPES.items()}
         for kind, message, log_time in MESSAGES:
-            writer.write(topics[kind], log_time, encode(message, INPUT_TYPES[kind]))
+            writer.write(topics[kind], log_time, encode(message, TRIAL_TYPES[kind]))
     recorded = read_session(tmp_path / 'bag')
     assert content(recorded.messages) == EXPECTED
     assert recorded.file_options is None and recorded.warnings == ()
@@ -186,9 +186,9 @@ def test_bag_by_rosbags(tmp_path, storage, mode, version):
 def test_db3_file_without_its_folder(tmp_path):
     with Writer(tmp_path / 'bag', version=9) as writer:
         topics = {kind: writer.add_connection(f'/{kind}', name, typestore=STORE)
-                  for kind, name in INPUT_TYPES.items()}
+                  for kind, name in TRIAL_TYPES.items()}
         for kind, message, log_time in MESSAGES:
-            writer.write(topics[kind], log_time, encode(message, INPUT_TYPES[kind]))
+            writer.write(topics[kind], log_time, encode(message, TRIAL_TYPES[kind]))
     assert content(read_session(tmp_path / 'bag' / 'bag.db3').messages) == EXPECTED
 
 
@@ -200,13 +200,13 @@ def test_file_by_mcap(tmp_path, chunked, short):
         writer = McapWriter(stream, use_chunking=chunked, compression=CompressionType.NONE)
         writer.start()
         channels = {}
-        for kind, name in INPUT_TYPES.items():
+        for kind, name in TRIAL_TYPES.items():
             schema = writer.register_schema(name.replace('/msg', '') if short else name, 'ros2msg', b'')
             channels[kind] = writer.register_channel(f'/{kind}', 'cdr', schema)
         other = writer.register_channel('/camera/goal_chain', 'json', 0)
         writer.add_message(other, START, b'{}', START)
         for kind, message, log_time in MESSAGES:
-            writer.add_message(channels[kind], log_time, encode(message, INPUT_TYPES[kind]), log_time)
+            writer.add_message(channels[kind], log_time, encode(message, TRIAL_TYPES[kind]), log_time)
         writer.finish()
     recorded = read_session(path)
     assert content(recorded.messages) == EXPECTED
@@ -248,7 +248,7 @@ def test_folder_whose_metadata_file_is_damaged(tmp_path, session, text):
 def test_undecodable_message_is_left_out_alone(tmp_path):
     with SessionWriter(tmp_path / 'session') as writer:
         write(writer, MESSAGES[:2])
-        writer.write('/calibrator/goal_chain', INPUT_TYPES[GOAL], b'\0\1\0\0\xff\xff', START + 2 * SECOND)
+        writer.write('/calibrator/goal_chain', TRIAL_TYPES[GOAL], b'\0\1\0\0\xff\xff', START + 2 * SECOND)
         write(writer, MESSAGES[2:])
     recorded = read_session(writer.path)
     assert content(recorded.messages) == EXPECTED
@@ -266,9 +266,9 @@ def whole_file(request, tmp_path_factory):
     if request.param == 'sqlite':
         with Writer(folder / 'bag', version=9) as writer:
             topics = {kind: writer.add_connection(f'/{kind}', name, typestore=STORE)
-                      for kind, name in INPUT_TYPES.items()}
+                      for kind, name in TRIAL_TYPES.items()}
             for kind, message, log_time in MESSAGES:
-                writer.write(topics[kind], log_time, encode(message, INPUT_TYPES[kind]))
+                writer.write(topics[kind], log_time, encode(message, TRIAL_TYPES[kind]))
         return (folder / 'bag' / 'bag.db3').read_bytes(), '.db3'
     if request.param in ('flushed', 'one chunk'):
         with SessionWriter(folder / 'session.mcap', {'seed': 3}) as writer:
@@ -276,18 +276,18 @@ def whole_file(request, tmp_path_factory):
         return writer.path.read_bytes(), '.mcap'
     with Writer(folder / 'bag', version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         topics = {kind: writer.add_connection(f'/{kind}', name, typestore=STORE)
-                  for kind, name in INPUT_TYPES.items()}
+                  for kind, name in TRIAL_TYPES.items()}
         for kind, message, log_time in MESSAGES:
-            writer.write(topics[kind], log_time, encode(message, INPUT_TYPES[kind]))
+            writer.write(topics[kind], log_time, encode(message, TRIAL_TYPES[kind]))
     if request.param == 'not compressed':
         return (folder / 'bag' / 'bag.mcap').read_bytes(), '.mcap'
     with (folder / 'plain.mcap').open('wb') as stream:
         writer = McapWriter(stream, use_chunking=False)
         writer.start()
         for kind, message, log_time in MESSAGES:
-            schema = writer.register_schema(INPUT_TYPES[kind], 'ros2msg', b'')
+            schema = writer.register_schema(TRIAL_TYPES[kind], 'ros2msg', b'')
             writer.add_message(writer.register_channel(f'/{kind}', 'cdr', schema), log_time,
-                               encode(message, INPUT_TYPES[kind]), log_time)
+                               encode(message, TRIAL_TYPES[kind]), log_time)
         writer.finish()
     return (folder / 'plain.mcap').read_bytes(), '.mcap'
 
@@ -598,7 +598,7 @@ def shifted(messages, seconds, log_time):
     """Return messages of a clock that went back, recorded later."""
     records = []
     for kind, message, _ in messages:
-        message = STORE.deserialize_cdr(encode(message, INPUT_TYPES[kind]), INPUT_TYPES[kind])
+        message = STORE.deserialize_cdr(encode(message, TRIAL_TYPES[kind]), TRIAL_TYPES[kind])
         message.header.stamp.sec -= seconds
         records.append((kind, message, log_time))
     return records

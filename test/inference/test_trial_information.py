@@ -5,6 +5,7 @@
 
 from dataclasses import replace
 
+from felt_trials import felt_trials, LIFTS, ROPE
 from fitted import fitted
 import numpy as np
 import pytest
@@ -21,9 +22,10 @@ from dlo_calibration.inference.trial_information import (
     without_repeated_goals,
 )
 from dlo_calibration.inference.uncertainty import UNKNOWN_STD
-from dlo_calibration.model.parameters import knot_names, ParameterSpace
+from dlo_calibration.model.parameters import BY_NAME, knot_names, ParameterSpace
 from dlo_calibration.observation.noise import noise
 from dlo_calibration.search import Hints, SEARCHES
+from dlo_calibration.simulation.compiled import CompiledSimulator
 from dlo_calibration.simulation.protocol import Rollout
 
 TRUTH = {'flexibility': 40.0, 'elasticity': 30.0, 'friction': 70.0, 'self_collision': 20.0}
@@ -250,3 +252,23 @@ def test_an_uninformative_trial_is_named():
     result = calibrated(trials, Deaf())
     assert uninformative(result.trials, result.examination) == ('idle',)
     assert uninformative(result.trials, None) == ()
+
+
+def test_forces_make_the_mass_known_while_trials_come():
+    trials, engine = felt_trials(1, lifts=LIFTS[:2]), CompiledSimulator(nodes=21)
+    space = ParameterSpace(('flexibility', 'elasticity', 'mass'))
+
+    def after(trials):
+        appraiser = Appraiser(space, Pool(engine), 0.6, 0.0, noise(trials))
+        appraisal = Appraisal.before(space.free, space.default_point())
+        for count in (1, 2):
+            appraisal = appraiser.after(appraisal, trials[:count])
+        return appraisal
+
+    felt = after(trials)
+    assert abs(BY_NAME['mass'].value(ROPE['mass']) / 100 - felt.point[2]) < 3 * felt.uncertainty.std[2]
+    assert felt.outlier(trials) == ''
+    numb = after([replace(trial, goals=tuple(replace(goal, forces=()) for goal in trial.goals))
+                  for trial in trials])
+    assert felt.uncertainty.std[2] < 0.1
+    assert numb.uncertainty.std[2] > 0.2

@@ -74,7 +74,7 @@ def test_result_has_the_values_of_the_whole_calibration(types):
         'headline': sample_result().headline, 'unusable': '', 'warnings': 'one; two', 'undetermined': '',
         'together': '',
         'cross_validated_error_mm': '', 'default_error_mm': '',
-        'noise_mm': '', 'residual_std_mm': ''}
+        'noise_mm': '', 'residual_std_mm': '', 'force_error_n': ''}
     assert status.level == types.level(1)
     clean = sample_result(warnings=(), seed=None)
     status, values = by_name(diagnostics.result(types, clean, STAMP))['calibration']

@@ -28,7 +28,7 @@ from dlo_calibration.calibration.options import Options
 from dlo_calibration.cli import main as cli
 from dlo_calibration.files.result import read_result
 from dlo_calibration.files.session import read_session
-from dlo_calibration.messages.codec import ACTION, GOAL, INITIAL, INPUT_TYPES, OUTPUT_TYPES
+from dlo_calibration.messages.codec import ACTION, GOAL, INITIAL, OUTPUT_TYPES, TRIAL_TYPES
 from dlo_calibration.model.parameters import PAPER_PARAMETERS
 from dlo_calibration.ros.calibrator_node import CalibratorNode
 from dlo_calibration.ros.graph_node import spin
@@ -92,7 +92,7 @@ def test_session_over_the_graph_gives_a_result_and_the_replay_the_same(start_nod
     assert f'dlo-calibration fit {folder.name}' in page
     assert page.count(' seen from above: ') == 3
     kinds = {record.name for record in read_session(folder).records}
-    assert kinds | {'advice'} == {*INPUT_TYPES, *OUTPUT_TYPES}
+    assert kinds | {'advice'} == {*TRIAL_TYPES, *OUTPUT_TYPES}
 
 
 def test_a_late_listener_gets_the_latched_messages(start_node):

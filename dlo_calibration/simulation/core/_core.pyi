@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 #: kinds of processors whose code this processor can execute, the fastest first; all give the same bits
 TARGETS: tuple[str, ...]
 
-Outcome = tuple[NDArray[np.float64], tuple[bool, ...], int, NDArray[np.float64] | None]  # see `roll_out`
+#: See `roll_out`.
+Outcome = tuple[NDArray[np.float64], tuple[bool, ...], int, NDArray[np.float64] | None, NDArray[np.float64]]
 
 class Start:
     """
@@ -149,10 +150,11 @@ def roll_out(jobs: Sequence[tuple[Script, Start, Mapping[str, float], float]], t
     :param target: one of `TARGETS`; empty: the fastest.
     :param scene: around the DLO of each job; None: nothing.
     :returns: for each job the nodes at the goals (g, N, 3) [m], whether the DLO was stable at each goal that
-        is a stable configuration (else True), the number of steps, and the loads; None if the rollout
-        diverged.  The loads (g, 3, 2) are the sharpest curvature [1/m], the largest tension [N] and the
-        largest strain since the goal before, each with its place: the index of a node, or the middle between
-        two; None if the script does not ask for them.  After a stop, outcomes are meaningless.
+        is a stable configuration (else True), the number of steps, the loads, and the forces (g, N, 3) [N]
+        with which hands hold nodes, 0 at others; None if the rollout diverged.  The loads (g, 3, 2) are the
+        sharpest curvature [1/m], the largest tension [N] and the largest strain since the goal before, each
+        with its place: the index of a node, or the middle between two; None if the script does not ask for
+        them.  After a stop, outcomes are meaningless.
     """
 
 class Rope:

@@ -301,20 +301,25 @@ void require_fit(const Script& script, std::size_t nodes) {
           " nodes; expected at most the ", nodes, " of the DLO; write the script for this DLO");
 }
 
-/// Nodes at the goals (g, N, 3), settled (g,), steps, and loads (g, 3, 2), or None if they were not measured;
-/// None: the rollout diverged.
+/// Vectors at the nodes, for each goal (g, N, 3).
+Array at_nodes(const std::vector<std::vector<Point>>& goals) {
+  const std::size_t nodes = goals.empty() ? 0 : goals[0].size();
+  Array rows({goals.size(), nodes, std::size_t{3}});
+  for (std::size_t k = 0; k < goals.size(); ++k) std::copy_n(&goals[k][0].x, 3 * nodes, rows.mutable_data(k, 0, 0));
+  return rows;
+}
+
+/// Nodes at the goals (g, N, 3), settled (g,), steps, loads (g, 3, 2), or None if they were not measured, and the
+/// forces that hold nodes at the goals (g, N, 3); None: the rollout diverged.
 py::object answer(const Outcome& outcome) {
-  const std::size_t nodes = outcome.seen.empty() ? 0 : outcome.seen[0].size();
-  Array seen({outcome.seen.size(), nodes, std::size_t{3}});
-  for (std::size_t k = 0; k < outcome.seen.size(); ++k)
-    std::copy_n(&outcome.seen[k][0].x, 3 * nodes, seen.mutable_data(k, 0, 0));
+  const Array seen = at_nodes(outcome.seen);
   if (outcome.diverged || !all_finite(seen)) return py::none();
   py::object loads = py::none();
   if (!outcome.loads.empty()) {
     static_assert(sizeof(Loads) == 6 * sizeof(double));
     loads = Array({outcome.loads.size(), std::size_t{3}, std::size_t{2}}, &outcome.loads[0].curvature.value);
   }
-  return py::make_tuple(seen, py::tuple(py::cast(outcome.settled)), outcome.steps, loads);
+  return py::make_tuple(seen, py::tuple(py::cast(outcome.settled)), outcome.steps, loads, at_nodes(outcome.forces));
 }
 
 py::list roll_out(const std::vector<JobTuple>& tuples, double time_step, const Stop* stop,

@@ -112,6 +112,8 @@ class Rollout {
 
   void see_now(const std::vector<Point>& now, double share, bool rests) {
     outcome.seen.push_back(now);
+    outcome.forces.emplace_back(now.size(), Point{0.0, 0.0, 0.0});
+    for (std::size_t h = 0; h < rope.held.size(); ++h) outcome.forces.back()[rope.held[h]] = rope.hand_forces[h];
     if (script_.loads) outcome.loads.push_back(meter_.take());
     if (rests) return;
     auto& seen = outcome.seen.back();

@@ -97,6 +97,7 @@ void Rope::hold(const std::vector<int>& nodes) {
   const int n = rods.nodes;
   held = nodes;
   targets.assign(held.size(), {}), hand_velocities.assign(held.size(), {}), turns.clear();
+  hand_forces.assign(held.size(), {});
   std::vector<bool> follows(n, false), rigid(n - 1);
   inverse_masses.resize(n);
   for (int i = 0; i < n; ++i) inverse_masses[i] = 1 / rods.masses[i];

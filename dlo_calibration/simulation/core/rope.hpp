@@ -271,6 +271,7 @@ class Rope {
   SceneContact surroundings;
   std::vector<int> held;
   std::vector<Point> targets, hand_velocities;  // of held nodes: after the coming step [m]; in it [m/s]
+  std::vector<Point> hand_forces;      // that hold them [N], smoothed
   std::vector<Matrix> turns;           // of their hands in the coming step; empty: clamps turn with segments
   std::vector<Clamp> clamps;
   std::vector<double> inverse_masses;  // 0 for held nodes

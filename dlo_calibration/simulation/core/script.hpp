@@ -100,6 +100,7 @@ struct Loads {
 /// The result of a rollout.
 struct Outcome {
   std::vector<std::vector<Point>> seen;  // nodes at each goal [m]
+  std::vector<std::vector<Point>> forces;  // that hold nodes at each goal [N]; 0 at those that no hand holds
   std::vector<bool> settled;             // for each goal; false: it is a stable one, and the DLO did not rest
   std::vector<Loads> loads;              // for each goal, since the one before; empty if not asked for
   int steps = 0;

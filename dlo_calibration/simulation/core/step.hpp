@@ -37,6 +37,20 @@ inline void hold(Rods<Number>& rods, const Ropes& ropes) {
   });
 }
 
+/// Compute the forces with which hands hold the nodes of a DLO in a lane: what its equations lack without them.
+/// The hands of a script change their speed within one step, and contact chatters: so the forces are smoothed.
+template <class Number>
+inline void find_hand_forces(Rods<Number>& rods, Rope& rope, int lane) {
+  constexpr double kSmoothing = 0.01;  // s
+  const double gain = rods.step / (kSmoothing + rods.step);
+  for (std::size_t h = 0; h < rope.held.size(); ++h) {
+    const int node = rope.held[h];
+    const Point missing = rope.hand_velocities[h] - in_lane(rods.predicted[node], lane);
+    const Point force = kHeld * in_lane(rods.masses[node], lane) / rods.step * missing;
+    rope.hand_forces[h] = rope.hand_forces[h] + gain * (force - rope.hand_forces[h]);
+  }
+}
+
 /// Keep the DLO in a lane from passing through itself in the coming step.
 template <class Number>
 inline void avoid_self_contact(Rods<Number>& rods, Rope& rope, int lane) {
@@ -80,6 +94,8 @@ void predict(Rods<Number>& rods, const Ropes& ropes) {
   const auto has_scene = [](const Rope* rope) { return rope->surroundings.scene != nullptr; };
   if (std::any_of(ropes.begin(), ropes.end(), has_scene)) solve_among_bodies(rods, ropes);
   else solve(rods);
+  for (std::size_t lane = 0; lane < ropes.size(); ++lane)
+    find_hand_forces(rods, *ropes[lane], static_cast<int>(lane));
   each_held(ropes, [&](int lane, int node, const Point& velocity, const Point&) {
     set_lane(rods.predicted[node], lane, velocity);
   });
