@@ -170,8 +170,8 @@ class _Seeker:
         local = known.std**2 if known.local is None else np.diag(known.local)
         bound = (known.lower <= 0) | (known.upper >= 1)
         self._trust = np.where(bound, np.clip(np.sqrt(local) / known.std, LEAST_TRUST, 1.0), 1.0)
-        level = noise_of([start.points[None]])
-        self._scale = float(np.hypot(ERRORS * np.nan_to_num(level), MODEL_ERROR * self._length))
+        self._noise = float(np.nan_to_num(noise_of([start.points[None]])))
+        self._scale = float(np.hypot(ERRORS * self._noise, MODEL_ERROR * self._length))
         self._draws = [self._space.physical(self._space.values(point), self._length)
                        for point in self._points(FEW)]
 
@@ -181,7 +181,7 @@ class _Seeker:
     def _expectation(self, inquiries: Sequence[Inquiry], count: int, wanted: Floats) -> Expectation:
         return Expectation.of([inquiry.trial for inquiry in inquiries], self._space, self._pool,
                               self._points(count), self._uncertainty, self._scale, self._length, wanted,
-                              [inquiry.slips for inquiry in inquiries], self._trust)
+                              self._noise, trust=self._trust)
 
     def found(self) -> NextAction:
         """Return the next action."""
@@ -193,7 +193,7 @@ class _Seeker:
         if self._count < MOST_TRIALS:
             far &= then > SHOWN * nothing.std
         # What earlier trials left unknown, though they promised to show some of it, needs a clear view.
-        single = expectation.deviations(expectation.informations[expectation.possible]).mean(axis=1)
+        single = np.array([expectation.expected(k) for k in np.flatnonzero(expectation.possible).tolist()])
         far |= self._uncertainty.unknown & (nothing.std > wanted) & (
             single.min(axis=0, initial=np.inf) > CLEAR * nothing.std)
         if self._count >= TOLD_AFTER and far.any():
@@ -232,8 +232,7 @@ class _Seeker:
                       for other in self._inquiries.beside(inquiry, BESIDE * BEST // best, generator)]
             more = self._expectation(others, MANY, wanted)
             tried += others
-            expectation = replace(expectation, informations=np.concatenate(
-                [expectation.informations, more.informations]))
+            expectation = expectation.with_others(more)
         return tried, expectation
 
     def _permitted(self, ranked: Sequence[Inquiry]) -> list[Inquiry]:

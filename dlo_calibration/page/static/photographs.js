@@ -3,6 +3,7 @@
 
 /** Step 1, photographs: their files, and the start and goal of each trial. */
 
+import {advised} from './advice.js';
 import {openCamera} from './camera.js';
 import {h} from './dom.js';
 import {dropped} from './dropped.js';
@@ -142,6 +143,7 @@ export class PhotographsStep {
         ),
         problem(this.app.project, PLACE),
       ),
+      advised(this.app),
       films.length
         ? h(
             'section',
