@@ -33,7 +33,7 @@ STRIDE = 0.1  # largest step of a derivative at a draw: draws cover the rest of 
 MOST_TRIALS = 8  # that are foreseen; a target that needs more is out of reach
 REACHED = 1.02  # times the target, which counts as reached in what is foreseen
 GRIP_ERROR = 3e-3  # m along the DLO: standard deviation of where robots and people grip
-STARTS = 2  # simulations of each trial from a start with other noise
+STARTS = 1  # simulations of each trial from a start with other noise, at each draw
 FAILURES = 0.5  # share of the draws of an action that may fail
 
 
@@ -52,16 +52,17 @@ def _slipped(trial: Trial) -> Iterator[Trial]:
 
 
 def _changes(trials: Sequence[Trial], space: ParameterSpace, pool: Pool, points: Floats, steps: Floats,
-             shown: NDArray[np.bool_], length: float, noise: float
+             shown: NDArray[np.bool_], length: float, noise: float, finer: Pool | None
              ) -> Iterator[tuple[Floats, Floats] | None]:
     """
     Yield, for each trial at each draw, how its chains change: None if it fails.
 
     :returns: the derivatives by the parameters, (m, d) [m per unit cube], and the changes by each error that
-        all residuals of the trial share, (m, e) [m]: of where a hand grips, and of the noise of the start.
+        all residuals of the trial share, (m, e) [m]: of where a hand grips, of the noise of the start, and of
+        nodes and time step.
     """
     starts = with_other_noise(trials, noise, STARTS, np.random.default_rng(0)) if noise > NO_NOISE else []
-    jobs, beside = [], []
+    jobs, beside, here_alone = [], [], []
     for trial, row, *noisy in zip(trials, shown, *starts, strict=True):
         versions = trial, *noisy, *_slipped(trial)
         for point in points:
@@ -69,15 +70,18 @@ def _changes(trials: Sequence[Trial], space: ParameterSpace, pool: Pool, points:
             at, *away = (space.physical(space.values(each), length)
                          for each in (point, *differences.points))
             jobs += [(version, at) for version in versions] + [(trial, each) for each in away]
+            here_alone.append((trial, at))
             beside.append((differences, len(versions)))
     rollouts = iter(pool.simulate(jobs))
+    fine = iter(() if finer is None else finer.simulate(here_alone))
     for differences, count in beside:
-        some = list(islice(rollouts, count + len(differences.points)))
+        some = [*islice(rollouts, count + len(differences.points)), *islice(fine, 1)]
         chains = [rollout.chains.ravel() for rollout in some
                   if not isinstance(rollout, SimulationError) and all(rollout.settled)]
         if len(chains) < len(some):
             yield None
             continue
+        refined = [chains.pop()] if finer is not None else []
         here, sides = chains[0], chains[count:]
         columns = differences.jacobian(np.zeros((len(here), space.dimension)), sides)
         for k, (low, high) in zip(differences.columns, zip(sides[::2], sides[1::2], strict=True),
@@ -88,7 +92,7 @@ def _changes(trials: Sequence[Trial], space: ParameterSpace, pool: Pool, points:
             chance = float(np.sum((low - 2 * here + high)**2)) / 3
             change = float(np.sum((high - low)**2))
             columns[:, k] *= np.sqrt(max(0.0, 1 - chance / change)) if change > 0 else 0.0
-        errors = (np.array(chains[1:count]).reshape(count - 1, len(here)) - here).T
+        errors = (np.array([*chains[1:count], *refined]).reshape(-1, len(here)) - here).T
         errors[:, :len(starts)] /= np.sqrt(STARTS)
         yield columns, errors
 
@@ -124,7 +128,8 @@ class Expectation:
     @classmethod
     def of(cls, trials: Sequence[Trial], space: ParameterSpace, pool: Pool, points: Floats,
            uncertainty: Uncertainty, scale: float, length: float, wanted: Floats, noise: float = 0.0,
-           varied: NDArray[np.bool_] | bool = True, trust: Floats | float = 1.0) -> Expectation:
+           varied: NDArray[np.bool_] | bool = True, trust: Floats | float = 1.0,
+           finer: Pool | None = None) -> Expectation:
         """
         Simulate the trials of the actions, whose goals are placeholders, at and beside (K, d) draws.
 
@@ -132,6 +137,8 @@ class Expectation:
         :param noise: standard deviation of one coordinate of the chains that they start from [m].
         :param varied: (d,) False for parameters of which actions count as telling nothing, to save time.
         :param trust: (d,) how much of what linear models promised was found so far, for each parameter.
+        :param finer: with twice the nodes and half the time step, which shows the error of those; None: that
+            is not simulated.
         :raises CancelledError: when stopped.
         """
         count = len(points)
@@ -141,7 +148,7 @@ class Expectation:
             np.full((2, dimension, dimension), np.nan) if changes is None else
             _told(changes[0] * trust / scale, changes[1] / scale) for changes in _changes(
                 trials, space, pool, points, np.clip(uncertainty.std, STEP, STRIDE), shown & varied, length,
-                noise)]).reshape(len(trials), count, 2, dimension, dimension)
+                noise, finer)]).reshape(len(trials), count, 2, dimension, dimension)
         failed = np.isnan(told[:, :, 0, 0, 0]).mean(axis=1) > FAILURES
         told[failed] = np.nan
         told[~failed] = np.nan_to_num(told[~failed])  # a draw with which the action fails tells nothing

@@ -221,6 +221,14 @@ class Appraisal:
         return (f'{trials[k].name} does not fit the others: {measured(float(errors[k]), "m")} from what they '
                 f'predict, where they miss {measured(usual, "m")}; {SOMETHING_ELSE}: repeat it')
 
+    @property
+    def promised(self) -> Floats:
+        """The standard deviations, (d,), if the models were linear, and the only errors white ones."""
+        if not self.models:
+            return self.uncertainty.std
+        told = sum((model.fit.information for model in self.models), np.zeros(2 * (len(self.point),)))
+        return standard_deviations(told / self.uncertainty.scale**2 + prior_information(len(self.point)))
+
     @classmethod
     def before(cls, names: tuple[str, ...], point: Floats) -> Appraisal:
         """Return the appraisal before any simulation, at a (d,) point to begin from."""

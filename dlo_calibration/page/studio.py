@@ -46,6 +46,7 @@ from dlo_calibration.writing import make_folder, write_file
 
 MOST_FILMS = 8  # in memory
 LIFT = 0.1  # m, of an advised movement
+STILL = 1e-3  # m; a hand that moves less along the table goes up or down, or waits
 CHAIN_FILES = {'csv': chain_csv, 'xml': chain_xml}
 
 
@@ -424,7 +425,8 @@ class Studio:
         ways = []
         for hand in () if advice.action is None else advice.action.hands:
             flat = np.column_stack([hand.positions[:, :2], np.full(len(hand.times), hand.positions[0, 2])])
-            ways.append(np.round(view[1].to_pixels(flat), 1).tolist())
+            turns = np.append(True, np.linalg.norm(np.diff(flat, axis=0), axis=1) > STILL)
+            ways.append(np.round(view[1].to_pixels(flat[turns]), 1).tolist())
         said = advice.words.removeprefix(f'{HANDS[0]}: ')
         return {'words': said[:1].upper() + said[1:], 'view': view[0], 'ways': with_nulls(ways)}
 

@@ -57,7 +57,8 @@ class Inquiry:
             what = f'drag it by {100 * way:.0f} cm' if kind != LIFTING else \
                 f'lift it by {100 * lift:.0f} cm' + (f' and carry it by {100 * way:.0f} cm'
                                                      if way > 0.005 else '')
-            end = {0: 'the first end', len(places) - 1: 'the last end'}
+            end = {0: 'the first end', int(np.abs(places - 0.5).argmin()): 'the middle',
+                   len(places) - 1: 'the last end'}
             parts.append(f'{name}: grip {end.get(grip, f"{places[grip]:.2f} of the length")}, {what}')
         wait = '' if self.pause is None else f'; wait for {self.pause[1] - self.pause[0]:.3g} s, in which ' \
             'the DLO is observed'

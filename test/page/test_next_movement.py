@@ -56,6 +56,7 @@ def test_the_way_is_projected_into_the_goal_photograph_of_the_last_trial(page):
     way, = advice['ways']
     assert way[0] == pytest.approx(FROM, abs=1.0)
     assert way[-1] == pytest.approx(TO, abs=1.0)
+    assert len(way) == 2  # lifting does not move it along the table
 
 
 def test_an_incomplete_trial_takes_the_advice_away(page):
@@ -81,6 +82,8 @@ def test_a_person_sees_the_arrow_after_each_pair_of_photographs(page):
         box, (u, v) = head.bounding_box(), tab.place(TO)
         assert box['x'] - 6 <= u <= box['x'] + box['width'] + 6
         assert box['y'] - 6 <= v <= box['y'] + box['height'] + 6
+        turned = float(head.get_attribute('transform').removeprefix('rotate(').removesuffix(')'))
+        assert turned == pytest.approx(np.degrees(np.arctan2(*(TO - FROM)[::-1])), abs=1.0)
         assert tab.find('#drawn .advised').count() == 1
         assert tab.find('#drawn .playing').count() == 1
         tab.photograph('Start')
