@@ -152,7 +152,7 @@ def test_a_search_never_sees_a_trial():
 SLOW = {'jinja2', 'matplotlib', 'pybullet', 'rclpy', 'scipy'}
 LOADED = (
     ((['info', 'msg_samples/object1'], ['info', 'msg_samples/xml/named_actions.xml'], ['--help']), set()),
-    ((['plot', 'msg_samples/xml/push_and_release.xml'],), {'matplotlib'}),
+    pytest.param((['plot', 'msg_samples/xml/push_and_release.xml'],), {'matplotlib'}, marks=pytest.mark.long),
     ((['fit', 'msg_samples/object1', *'--workers 2 --calibrate friction --evaluations 4'.split()],),
      set()),
 )

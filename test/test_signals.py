@@ -81,7 +81,7 @@ def test_a_second_signal_while_the_first_one_ends_it_adds_no_line():
     assert (done.returncode, done.stderr) == (128 + signal.SIGINT, 'dlo-calibration: interrupted\n')
 
 
-@pytest.mark.parametrize('words', [(), ('--json',)])
+@pytest.mark.parametrize('words', [('--json',), pytest.param((), marks=pytest.mark.long)])
 def test_a_full_standard_output_gives_one_line(words):
     with open('/dev/full', 'w') as full:
         done = subprocess.run(

@@ -119,7 +119,7 @@ def application(studio: Studio, events: Events, guard: Guard, token: str) -> web
             ('GET', '/api/films/{id}/frame', routes.frame), ('GET', '/api/films/{id}/line', routes.line),
             ('GET', '/api/films/{id}/simulated', routes.simulated),
             ('POST', '/api/films/{id}/follow', routes.follow),
-            ('GET', '/api/film/{number}', routes.film), ('GET', '/api/files/{name}', routes.file),
+            ('GET', '/api/animation/{number}', routes.animation), ('GET', '/api/files/{name}', routes.file),
             ('GET', '/api/topics', routes.topics), ('POST', '/api/topics', routes.add_topic_image),
             ('POST', '/api/send', routes.send)):
         app.router.add_route(method, base + path, handler)
@@ -200,13 +200,13 @@ class Routes:
         """End the calibration with the best so far."""
         return await self._changed(self._studio.stop)
 
-    async def film(self, request: web.Request) -> web.StreamResponse:
+    async def animation(self, request: web.Request) -> web.StreamResponse:
         """Give the simulated motion of a trial."""
         number = request.match_info['number']
         if not re.fullmatch('[0-9]{1,3}', number):
             raise web.HTTPNotFound
         identity = request.query.get('photograph', '')
-        return await self._answer(partial(self._studio.film, int(number), identity))
+        return await self._answer(partial(self._studio.animation, int(number), identity))
 
     async def add_film(self, request: web.Request) -> web.StreamResponse:
         """Take a film, piece by piece."""

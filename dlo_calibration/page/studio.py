@@ -27,9 +27,9 @@ from dlo_calibration.evaluation.digest import digest
 from dlo_calibration.files.chain_file import chain_csv, chain_xml
 from dlo_calibration.files.result import read_description
 from dlo_calibration.model.trial import Trial
+from dlo_calibration.page.animation import animated, animated_motion
 from dlo_calibration.page.calibration import ProjectCalibration
-from dlo_calibration.page.film import film, film_motion
-from dlo_calibration.page.filming import FilmRoom
+from dlo_calibration.page.film_room import FilmRoom
 from dlo_calibration.page.graph import PageGraph
 from dlo_calibration.page.information import Information
 from dlo_calibration.planning.limits import HANDS
@@ -44,7 +44,7 @@ from dlo_calibration.workspace.folder import FILES, REQUEST, RESULT, SESSION
 from dlo_calibration.workspace.source import read_source, Selection
 from dlo_calibration.writing import make_folder, write_file
 
-MOST_FILMS = 8  # in memory
+MOST_ANIMATIONS = 8  # in memory
 LIFT = 0.1  # m, of an advised movement
 STILL = 1e-3  # m; a hand that moves less along the table goes up or down, or waits
 CHAIN_FILES = {'csv': chain_csv, 'xml': chain_xml}
@@ -70,8 +70,8 @@ class Studio:
         self._drafter = Drafter(project)
         self._information = Information(make_simulator)
         self._calibration = ProjectCalibration(project.folder, make_simulator, options)
-        self._films: dict[str, Motion] = {}  # the newest last
-        self._film_lock = threading.Lock()
+        self._animations: dict[str, Motion] = {}  # the newest last
+        self._animation_lock = threading.Lock()
         self._film_room = FilmRoom(project)
         self._fresh: list[str] = []  # ids of photographs whose tracers are not prepared yet
         self._newest: Drafts | None = None
@@ -195,9 +195,9 @@ class Studio:
         found = checked(file, source.trials, source.options, self._make_simulator)
         return {'verdict': found.verdict, 'words': list(found.words)}
 
-    def film(self, number: int, identity: str) -> dict[str, Any]:
+    def animation(self, number: int, identity: str) -> dict[str, Any]:
         """
-        Return the simulated motion of a trial, over a photograph, see `film`.
+        Return the simulated motion of a trial, over a photograph, see `animated`.
 
         :param number: of the trial, from 0.
         :raises InputError: where there is no result, no such trial, or no scale.
@@ -206,22 +206,23 @@ class Studio:
             drafts = self._drafts.trials
             trial = drafts[number].trial if number < len(drafts) else None
             if trial is None:
-                raise InputError(f'film of trial {number + 1}', 'a trial that is not complete',
+                raise InputError(f'animation of trial {number + 1}', 'a trial that is not complete',
                                  'a complete trial', 'complete it as the page says')
             scale = self._drafts.photographs[self._checked(identity)].scale
             if scale is None:
-                raise InputError('film', 'a photograph without a scale', 'one with a scale',
+                raise InputError('animation', 'a photograph without a scale', 'one with a scale',
                                  'give it a scale first')
             description = self._calibration.description
             if description is None:
-                raise InputError('film', 'no result yet', 'a result', 'calibrate first')
-        with self._film_lock:  # one simulation at a time
+                raise InputError('animation', 'no result yet', 'a result', 'calibrate first')
+        with self._animation_lock:  # one simulation at a time
             key = digest(description.physical(), description.file_options.values, trial)
-            motion = self._films.pop(key, None) or film_motion(trial, description, self._make_simulator)
-            self._films[key] = motion
-            if len(self._films) > MOST_FILMS:
-                del self._films[next(iter(self._films))]
-        return film(trial, motion, scale)
+            motion = (self._animations.pop(key, None)
+                      or animated_motion(trial, description, self._make_simulator))
+            self._animations[key] = motion
+            if len(self._animations) > MOST_ANIMATIONS:
+                del self._animations[next(iter(self._animations))]
+        return animated(trial, motion, scale)
 
     def film_path(self, identity: str) -> Path:
         """Return the file of a film."""
@@ -248,7 +249,7 @@ class Studio:
             entry, description = self._entry(identity), self._calibration.description
         if description is None:
             raise InputError('film', 'no result yet', 'a result', 'calibrate first')
-        with self._film_lock:  # one simulation at a time
+        with self._animation_lock:  # one simulation at a time
             return self._film_room.simulated(entry, description, self._make_simulator)
 
     def file(self, name: str) -> bytes:

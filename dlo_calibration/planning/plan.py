@@ -14,7 +14,7 @@ from dlo_calibration.calibration.result import with_nulls
 from dlo_calibration.model.action import Action, Hand, NO_ROTATION
 from dlo_calibration.model.chain import Chain, Floats, grip_place
 from dlo_calibration.model.pose import Pose
-from dlo_calibration.planning.loads import ActionLoads, plain_loads
+from dlo_calibration.planning.action_loads import ActionLoads, plain_loads
 
 
 @dataclass(frozen=True)

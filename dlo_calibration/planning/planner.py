@@ -22,10 +22,10 @@ from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain, Floats, frozen_array
 from dlo_calibration.model.parameters import GRAVITY, natural_curvature
 from dlo_calibration.observation.table import HANGING, lying_level, RESTING_BAND
+from dlo_calibration.planning.action_loads import loads_of_actions
 from dlo_calibration.planning.beam import BeamSearch, JudgedSequence, Objective
 from dlo_calibration.planning.dlo import CalibratedDlo, intervals, Posterior
 from dlo_calibration.planning.limits import crossings, HANDS
-from dlo_calibration.planning.loads import loads_of_actions
 from dlo_calibration.planning.options import PlanOptions
 from dlo_calibration.planning.plan import Plan, PlannedAction
 from dlo_calibration.planning.rehearsal import ActionStep, RehearsalJob, Rehearser

@@ -22,8 +22,8 @@ from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain, Floats, frozen_array
 from dlo_calibration.model.named_actions import NamedAction, SimultaneousActions
 from dlo_calibration.observation.noise import NO_NOISE, noise_of
+from dlo_calibration.planning.action_loads import ActionLoads, loads_of_actions
 from dlo_calibration.planning.dlo import CalibratedDlo, intervals, Posterior
-from dlo_calibration.planning.loads import ActionLoads, loads_of_actions
 from dlo_calibration.planning.plan import plain_action
 from dlo_calibration.planning.rehearsal import ActionStep, in_turn, PAUSE, Rehearsal, RehearsalJob, rehearse
 

@@ -33,7 +33,7 @@ from dlo_calibration.model.parameters import (
 from dlo_calibration.model.score import MEAN_DISTANCE, SIMILAR, VERY_SIMILAR
 
 if TYPE_CHECKING:
-    from dlo_calibration.planning.loads import ActionLoads
+    from dlo_calibration.planning.action_loads import ActionLoads
     from dlo_calibration.planning.plan import Plan
     from dlo_calibration.planning.prediction import PredictedStep, Prediction
 

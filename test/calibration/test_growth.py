@@ -76,6 +76,7 @@ class Counting(ToySimulator):
         return super().simulate(trial, physical)
 
 
+@pytest.mark.long
 def test_a_calibration_simulates_linearly_more():
     rollouts = []
     for size in (5, 10, 20):

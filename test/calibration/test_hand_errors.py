@@ -127,6 +127,7 @@ def test_a_grip_that_nobody_named_stays_so_in_messages_and_requests(tmp_path):
                 assert (its.grips, its.offset) == (hand.grips, pytest.approx(hand.offset, abs=1e-6))
 
 
+@pytest.mark.long
 def test_a_result_corrects_the_hands_of_the_trials_that_it_is_validated_on(tmp_path):
     wrong = fit((*PHYSICS, *HANDS[:3]), late=-0.08, shift=(0.015, 0.0, 0.0))
     write_result(tmp_path / 'result.xml', wrong)
@@ -149,6 +150,7 @@ def test_a_result_corrects_the_hands_of_the_trials_that_it_is_validated_on(tmp_p
         validated(file, missed[:1], options)
 
 
+@pytest.mark.long
 def test_a_result_is_not_usable_on_trials_of_another_dlo(tmp_path):
     write_result(tmp_path / 'result.xml', fit())
     file, options = read_result(tmp_path / 'result.xml'), Options(mass=MASS, engine='compiled', workers=1)
@@ -160,6 +162,7 @@ def test_a_result_is_not_usable_on_trials_of_another_dlo(tmp_path):
         stiff, trials, options).unusable)
 
 
+@pytest.mark.long
 def test_a_result_with_given_errors_of_the_hands_keeps_them(tmp_path):
     given = fit((*PHYSICS,), late=-0.08, hand_delay=-0.08)
     write_result(tmp_path / 'fixed.xml', given)

@@ -41,6 +41,7 @@ def divided(stiff_middle):
     return calibrated(stiff_middle, on_evaluation=seen.append), seen
 
 
+@pytest.mark.long
 def test_a_dlo_that_is_stiffer_in_the_middle_gets_four_parts(divided):
     # Two parts cannot show it: both have the same stiffness.
     result, _ = divided

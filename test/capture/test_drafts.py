@@ -110,7 +110,8 @@ def test_photographs_become_a_trial_and_only_changed_clicks_are_traced_again(pro
 
 @pytest.mark.parametrize('edit, problem, text', [
     (lambda start: start.update(clicks=[[5, 5], [99999, 5]]), 'trace_problem', 'click 2'),
-    (lambda start: start.update(scale={'kind': 'board'}), 'scale_problem', 'board'),
+    pytest.param(lambda start: start.update(scale={'kind': 'board'}), 'scale_problem', 'board',
+                 marks=pytest.mark.long),
 ])
 def test_a_fault_in_one_photograph_leaves_the_other(project, edit, problem, text):
     change(project, lambda plain: edit(plain['photographs'][0]))

@@ -395,7 +395,8 @@ sys.exit(cli.main(sys.argv[3:], lambda options: toy))
 
 
 @pytest.mark.parametrize(('workers', 'rollout', 'code'), [
-    pytest.param(1, 'short', 0, marks=pytest.mark.long), (2, 'short', 0), (2, 'for ever', 130)])
+    pytest.param(1, 'short', 0, marks=pytest.mark.long), (2, 'short', 0),
+    pytest.param(2, 'for ever', 130, marks=pytest.mark.long)])
 def test_interrupt_gives_the_best_so_far_or_nothing(session, tmp_path, workers, rollout, code):
     evaluated = tmp_path / 'evaluated'
     process = subprocess.Popen(

@@ -263,7 +263,8 @@ def test_a_journal_that_is_no_file_is_refused_at_once(run, session, tmp_path, ma
 
 
 @pytest.mark.parametrize(('workers', 'number'), [
-    pytest.param(1, signal.SIGINT, marks=pytest.mark.long), (2, signal.SIGTERM)])
+    pytest.param(1, signal.SIGINT, marks=pytest.mark.long),
+    pytest.param(2, signal.SIGTERM, marks=pytest.mark.long)])
 def test_an_interrupt_keeps_finished_calibrations(session, tmp_path, workers, number):
     process = started(session, tmp_path / 'out', workers)
     process.send_signal(number)

@@ -54,6 +54,7 @@ def test_ropes_hold_the_letters_for_which_the_strokes_are_too_sharp(examples):
     assert max(sprung) > 0.005
 
 
+@pytest.mark.long
 def test_the_picture_and_the_film_show_all_ropes(examples, tmp_path, monkeypatch):
     letters, drawing = examples
     for name, fewer in (('STILL', 2), ('EVERY', 20), ('PRINTED', 80)):

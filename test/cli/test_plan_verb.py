@@ -117,6 +117,7 @@ def test_each_action_is_described_and_whether_the_goal_is_reached(run, chains, p
     assert text.endswith('The goal is longer than the DLO.')
 
 
+@pytest.mark.long
 def test_a_plan_around_the_posts_of_a_scene_says_what_the_hand_passes_and_names_the_scene(run, tmp_path):
     samples = ROPE.parents[1] / 'chains'
     code, output, notes = run(

@@ -56,6 +56,7 @@ def test_session_alone_gives_a_picture_per_trial(run, session, tmp_path):
     assert str(tmp_path / 'pictures' / 'trial_2.png') in notes
 
 
+@pytest.mark.long
 def test_result_is_drawn_too(run, session, result, tmp_path):
     run('plot', session, '--output', tmp_path / 'measured')
     code, output, _ = run('plot', session, result, '--output', tmp_path / 'both', '--json')
@@ -72,6 +73,7 @@ def test_result_is_drawn_too(run, session, result, tmp_path):
     assert simulated(measured) == 0 < simulated(both)
 
 
+@pytest.mark.long
 def test_animation_is_a_gif_per_trial(run, session, result, tmp_path, monkeypatch):
     monkeypatch.setattr('dlo_calibration.simulation.motion.FRAME_RATE', 2)
     monkeypatch.setattr('dlo_calibration.report.animation.FRAME_RATE', 2)

@@ -67,6 +67,7 @@ def numbers(act, *words):
     return [(trial['number'], trial['name']) for trial in printed['trials']]
 
 
+@pytest.mark.long
 def test_every_verb_leaves_trials_out_and_keeps_the_numbers_of_the_others(session, tmp_path, act):
     assert numbers(act, session, '--without', '2') == [(1, 'trial 1'), (3, 'trial 3')]
     assert numbers(act, session, '--without', '3,2') == numbers(
@@ -103,7 +104,8 @@ def request(path):
     return path
 
 
-@pytest.mark.parametrize('source', ['session', 'own', 'request'])
+@pytest.mark.parametrize('source', [
+    'session', *(pytest.param(name, marks=pytest.mark.long) for name in ('own', 'request'))])
 def test_an_interrupted_fit_goes_on_with_the_same_trials(source, session, own, tmp_path, act):
     path, selected = {'session': (session, ()), 'own': (own, REMAP),
                       'request': (request(tmp_path / 'request.xml'), ())}[source]

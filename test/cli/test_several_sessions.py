@@ -63,6 +63,7 @@ def test_one_value_for_all_fits_worse(fit, sessions):
     assert shared['parameters']['flexibility']['value'] == pytest.approx(40, abs=1)
 
 
+@pytest.mark.long
 def test_the_files_of_the_result_give_it_again(fit, sessions, tmp_path):
     printed = fit(*sessions, '--own', 'friction', '--without', 2, '--output', tmp_path / 'out')[1]
     assert printed['trials'] == 5

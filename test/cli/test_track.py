@@ -121,19 +121,28 @@ def test_images_of_a_recorded_session_are_a_film(resting, tmp_path, capsys):
     assert '/camera/image_raw' in capsys.readouterr().err
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('arguments, said', [
-    (['--points', '10,10'], 'two or more'),
-    *(pytest.param(*case, marks=pytest.mark.long) for case in (
-        (['--points', '10,10 40,40', '--board'], 'clicks'),
-        (['--board', '--at', '100'], '--at'),
-        (['--board', '--held', '20,20'], '--held'))),
-    (['--board', '--held', '20'], '--held'),
-    (['--board', '--count', '2'], '--count'),
-])
-def test_bad_arguments_get_one_line_with_the_remedy(resting, capsys, arguments, said):
+    (['--points', '10,10 40,40', '--board'], 'clicks'), (['--board', '--at', '100'], '--at'),
+    (['--board', '--held', '20,20'], '--held')])
+def test_arguments_that_do_not_fit_the_film_get_one_line_with_the_remedy(resting, capsys, arguments, said):
     path, points, _ = resting
     given = arguments if '--points' in arguments else ['--points', points, *arguments]
-    assert main(['track', str(path), *given]) == 2
+    refused(capsys, said, 'track', path, *given)
+
+
+@pytest.mark.parametrize('arguments, said', [
+    (['--points', '10,10'], 'two or more'),
+    (['--points', '10,10 40,40', '--board', '--held', '20'], '--held'),
+    (['--points', '10,10 40,40', '--board', '--count', '2'], '--count')])
+def test_bad_arguments_get_one_line_with_the_remedy(tmp_path, capsys, arguments, said):
+    write_film(tmp_path / 'film.mp4', [np.zeros((120, 160, 3), dtype=np.uint8)] * 2, RATE)
+    refused(capsys, said, 'track', tmp_path / 'film.mp4', *arguments)
+
+
+def refused(capsys, said, *words):
+    """Check that a command ends with one line that says what and the remedy."""
+    assert main([*map(str, words)]) == 2
     line = capsys.readouterr().err.strip().splitlines()[-1]
     assert said in line
     assert ';' in line

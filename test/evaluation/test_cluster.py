@@ -155,6 +155,7 @@ def test_without_workers_it_says_so_and_waits(scheduler):
     assert 'has no workers yet' in notices[0]
 
 
+@pytest.mark.long
 def test_a_machine_without_a_module_or_with_another_version_is_refused(scheduler, start_worker, tmp_path):
     (tmp_path / 'toy_simulator.py').touch()
     for path, words in ((ROOT, 'a machine without the module toy_simulator; .* install'),

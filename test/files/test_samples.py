@@ -27,7 +27,7 @@ from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.planning.options import PlanOptions
 from dlo_calibration.planning.planner import checked
 from dlo_calibration.search import RandomSearch
-from dlo_calibration.simulation.bullet import BulletSimulator
+from dlo_calibration.simulation.compiled import CompiledSimulator
 
 pytestmark = pytest.mark.usefixtures('without_drawings', 'without_slices')
 
@@ -134,10 +134,8 @@ def test_yaml_messages_show_the_first_trial_of_object1(types):
 
 
 def test_yaml_messages_calibrate():
-    simulator = BulletSimulator(nodes=12, time_step=0.01)
-    result = fitted(sample_trials(sample_messages(bag_types())), ParameterSpace(mass=0.03), simulator,
-                       RandomSearch(4, seed=1), budget=2)
-    simulator.close()
+    result = fitted(sample_trials(sample_messages(bag_types())), ParameterSpace(mass=0.03),
+                    CompiledSimulator(nodes=12), RandomSearch(4, seed=1), budget=2)
     assert len(result.evaluations) == 2
     assert result.best.score < 100
 

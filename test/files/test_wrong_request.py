@@ -128,6 +128,7 @@ def test_requests_at_the_wrong_time_are_refused_once(ros_environment, tmp_path):
                              and not log.msg.startswith('Not usable')] == expected)
 
 
+@pytest.mark.long
 def test_node_survives_mutated_bytes_and_calibrates_good_trials(ros_environment, tmp_path):
     with live_node(ros_environment, tmp_path) as robot:
         types = robot_types()

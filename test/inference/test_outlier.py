@@ -51,6 +51,7 @@ def calibrated(session, trials):
     return calibrate(trials, replace(session.options, engine='compiled', workers=1))
 
 
+@pytest.mark.long
 def test_no_trial_of_a_sample_is_an_outlier(session):
     assert calibrated(session, session.trials).outlier is None
 

@@ -616,7 +616,9 @@ def long_session(name, count):
     return begin + stream(3.2, 3.2 + count / 30)
 
 
-@pytest.mark.parametrize('order', ORDERS)
+@pytest.mark.parametrize('order', [
+    'in order', 'shuffled',
+    *(pytest.param(order, marks=pytest.mark.long) for order in sorted({*ORDERS} - {'in order', 'shuffled'}))])
 @pytest.mark.parametrize('name', ['resting', 'swinging', 'actions', 'trials'])
 def test_the_work_is_in_proportion_to_the_messages_in_any_order_of_arrival(monkeypatch, name, order):
     work = Counter()

@@ -76,6 +76,7 @@ def test_what_is_no_film_is_refused_and_leaves_no_file(tmp_path):
         assert list((tmp_path / 'project' / 'films').iterdir()) == []
 
 
+@pytest.mark.long
 def test_clicks_beside_any_dlo_are_a_problem_of_the_film(tmp_path, short):
     with served(tmp_path / 'project') as page:
         identity = page.done('POST', 'api/films', short.read_bytes())['id']

@@ -160,7 +160,7 @@ def test_a_whole_trial_from_upload_to_result(opened, empty, tmp_path):
     simulated = tab.find('.line.simulated polyline').first
     simulated.wait_for()
     at_goal = simulated.get_attribute('points')
-    tab.field('Film of the simulated DLO').last.fill('0')
+    tab.field('Animation of the simulated DLO').last.fill('0')
     tab.find('output:has-text("0.0 s")').wait_for()
     assert simulated.get_attribute('points') != at_goal
     violations['result'] = tab.violations()

@@ -114,15 +114,15 @@ def test_the_result_has_files(finished):
 def test_the_film_ends_near_the_goal(finished):
     page, _, state = finished
     start, goal = (photograph['id'] for photograph in state['document']['photographs'])
-    film = json.loads(page.get(f'api/film/0?photograph={goal}'))
+    film = json.loads(page.get(f'api/animation/0?photograph={goal}'))
     pixels = np.array(film['pixels'])
     assert pixels.shape == (len(film['times']), 21, 2)
     assert film['names'] == ['left_hand']
     assert film['hands'][film['goal']] == [None]
     holds = next(hands for hands in film['hands'] if hands[0] is not None)
     assert holds[0] == pytest.approx(state['trials'][0]['hands'][0]['start_pixels'][0], abs=5)
-    assert page.refused('GET', f'api/film/1?photograph={goal}')[0] == 400
-    assert page.refused('GET', 'api/film/0?photograph=../../et')[0] == 404
+    assert page.refused('GET', f'api/animation/1?photograph={goal}')[0] == 400
+    assert page.refused('GET', 'api/animation/0?photograph=../../et')[0] == 404
 
 
 def test_a_reopened_project_has_everything(finished, tmp_path):
@@ -137,7 +137,8 @@ def test_a_reopened_project_has_everything(finished, tmp_path):
         assert after['calibration']['state'] == 'done'
         assert after['calibration']['files'] == before['calibration']['files']
         goal = before['document']['photographs'][1]['id']
-        assert again.get(f'api/film/0?photograph={goal}') == page.get(f'api/film/0?photograph={goal}')
+        shown = f'api/animation/0?photograph={goal}'
+        assert again.get(shown) == page.get(shown)
         state = again.change(lambda document: document['trials'][0]['steps'][0].update(fraction=0.5))
         assert state['calibration']['result']['outdated']
 
@@ -343,7 +344,8 @@ def test_an_address_without_the_token_is_not_found(shared):
 
 @pytest.mark.parametrize('path', [
     'page/..%2fserver.py', 'page/%2e%2e/server.py', 'api/files/..%2fproject.json', 'api/files/project.json',
-    'api/photographs/..%2f..%2fx/picture', 'api/board/a5.pdf', 'api/film/x', 'api/nothing', 'api/files/'])
+    'api/photographs/..%2f..%2fx/picture', 'api/board/a5.pdf', 'api/animation/x', 'api/nothing',
+    'api/files/'])
 def test_names_never_lead_to_other_files(shared, path):
     assert shared.refused('GET', path)[0] == 404
 
@@ -449,6 +451,7 @@ def with_peg(document):
         {'photograph': photograph, 'kind': 'peg', 'first': [200, 250], 'second': [205, 250], 'height': 0.002}]
 
 
+@pytest.mark.long
 def test_obstacles_on_the_photograph_are_the_scene_of_the_calibration(tmp_path, command):
     folder = tmp_path / 'project'
     with served(folder, '--evaluations', 4, '--calibrate', 'flexibility', 'friction') as page:

@@ -13,8 +13,8 @@ from soft_simulator import follow, SoftSimulator
 from dlo_calibration import Action, Chain, Hand, Options
 from dlo_calibration.model.named_actions import GraspAndPlace, LiftAndHold
 from dlo_calibration.model.parameters import GRAVITY
+from dlo_calibration.planning.action_loads import plain_loads
 from dlo_calibration.planning.dlo import Posterior
-from dlo_calibration.planning.loads import plain_loads
 from dlo_calibration.planning.options import PlanOptions
 from dlo_calibration.planning.plan import plain_plan
 from dlo_calibration.planning.planner import plan

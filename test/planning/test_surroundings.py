@@ -84,6 +84,7 @@ def test_a_way_keeps_the_clearance_and_passes_bodies_at_the_given_side(side, tur
     assert np.linalg.norm(np.maximum(np.abs(local) - (0.01, 0.03), 0), axis=1).min() >= CLEARANCE - 1e-5
 
 
+@pytest.mark.long
 def test_a_place_that_a_ring_of_bodies_encloses_has_no_way():
     ring = [post(0.1 * np.cos(angle), 0.1 * np.sin(angle)) for angle in np.linspace(0, 2 * np.pi, 24)]
     around = Surroundings.of(ring, CLEARANCE)

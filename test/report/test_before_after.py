@@ -74,6 +74,7 @@ def test_a_trial_that_the_defaults_cannot_simulate_has_no_film(result):
     assert films(result, [0], OPTIONS, lambda _: ToySimulator(fail_below=45.0)) == {}
 
 
+@pytest.mark.long
 def test_plot_writes_the_films(result, tmp_path, without_drawings, capsys):
     session = write_session(tmp_path / 'session.mcap', session_messages(bag_types(), 2))
     write_result(tmp_path / 'result.xml', result, OPTIONS.flat())

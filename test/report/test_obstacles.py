@@ -94,6 +94,7 @@ def pixels_of_obstacles(path):
     return int((np.abs(image - ImageColor.getrgb(OBSTACLE)).sum(axis=2) < 6).sum())
 
 
+@pytest.mark.long
 def test_pictures_show_obstacles_and_the_same_section(tmp_path):
     trial, = toy_trials(1)
     middle = trial.initial.points.mean(axis=0)

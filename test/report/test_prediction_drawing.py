@@ -41,6 +41,7 @@ def test_chains_and_bands_are_drawn(prediction, tmp_path):
     assert count(with_band, BAND) > 3 * count(without, BAND)
 
 
+@pytest.mark.long
 def test_of_many_actions_five_are_shown(prediction, tmp_path):
     many = replace(prediction, steps=prediction.steps[:1] * 40)
     one = replace(prediction, steps=prediction.steps[:1])

@@ -318,6 +318,7 @@ def test_a_bad_command_line_gives_one_line_and_exit_code_2(ros_environment, argu
     assert one_line(errors)
 
 
+@pytest.mark.long
 def test_bad_command_line_ends_the_process(ros_environment, tmp_path):
     with child(ros_environment, tmp_path / 'out', *BAD[0]) as process:
         output, errors = process.communicate(timeout=PATIENCE)

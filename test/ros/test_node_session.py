@@ -157,7 +157,8 @@ def foreign_frame():
 
 @pytest.mark.parametrize(('octets', 'words'), [
     (bad_cloud, ('stamp of zero', 'header.stamp')), (foreign_frame, ('camera', 'world')),
-    (lambda: b'\0\1\0\0broken', ('do not decode', 'sensor_msgs/msg/PointCloud2')),
+    pytest.param(lambda: b'\0\1\0\0broken', ('do not decode', 'sensor_msgs/msg/PointCloud2'),
+                 marks=pytest.mark.long),
 ], ids=['stamp of zero', 'another frame', 'damaged bytes'])
 def test_a_refusal_is_reported_once_and_the_trials_stay(start, octets, words):
     graph = start()
@@ -321,6 +322,7 @@ def test_obstacles_are_shown_with_the_trials(start, tmp_path):
     assert {'scene/obstacles', 'trial_1/goal'} <= names
 
 
+@pytest.mark.long
 def test_trials_around_a_peg_are_fitted_with_the_scene_that_the_node_is_given(start, tmp_path):
     """The DLO was dragged around a peg: without it, no parameters lead there."""
     peg = ('<robot name="peg"><link name="table"><collision><origin xyz="0.4 0.05 0.05"/><geometry>'

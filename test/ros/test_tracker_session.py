@@ -3,6 +3,7 @@
 
 """The session of the tracker, behind a graph without ROS: images in, chains and actions out."""
 
+import functools
 import time
 
 import cv2
@@ -31,12 +32,17 @@ def curve(way=0.0):
 
 
 BOARD = LaidBoard((-0.25, -0.12))
-RENDERER = Renderer(plain_look(sheets=(BOARD.sheet,), colour=BLUE), RADIUS)
+
+
+@functools.cache
+def renderer():
+    """Return the renderer of the table, which takes a second to make."""
+    return Renderer(plain_look(sheets=(BOARD.sheet,), colour=BLUE), RADIUS, (-0.4, -0.35), (0.6, 0.5))
 
 
 def pixels(way=0.0):
     """Return an image of the DLO and the board."""
-    return RENDERER.image([Instant(CAMERA, curve(way))])
+    return renderer().image([Instant(CAMERA, curve(way))])
 
 
 def points(count=4):

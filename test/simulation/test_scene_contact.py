@@ -50,7 +50,7 @@ RESTS = [  # an obstacle, and the height at which the middle of a DLO that lies 
     pytest.param(obstacle('mesh', (1, 1, 1), (0, 0, 0.1), triangles=box_mesh((0.2, 0.4, 0.2))), 0.2,
                  id='mesh'),
     pytest.param(obstacle('mesh', (2, 1, -1), (0, 0, 0.1), triangles=box_mesh((0.1, 0.4, 0.2))), 0.2,
-                 id='mirrored mesh'),
+                 id='mirrored mesh', marks=pytest.mark.long),
 ]
 
 

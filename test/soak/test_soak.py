@@ -17,7 +17,8 @@ def test_every_campaign_can_be_conducted(name):
 
 
 @pytest.mark.pybullet
-@pytest.mark.parametrize(('name', 'amount'), [('bombs', 1), ('scenes', 10)])
+@pytest.mark.parametrize(('name', 'amount'), [
+    pytest.param('bombs', 1, marks=pytest.mark.long), ('scenes', 10)])
 def test_nothing_is_lost_and_nothing_dies(name, amount, tmp_path):
     tally = importlib.import_module(name).conduct(amount, 1, tmp_path)
     assert tally.tried == amount

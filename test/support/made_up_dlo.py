@@ -13,7 +13,7 @@ from dlo_calibration.calibration.result import ParameterEstimate
 from dlo_calibration.model.named_actions import Drag, GraspAndPlace
 from dlo_calibration.model.parameters import PAPER_PARAMETERS, ParameterSpace
 from dlo_calibration.model.score import PointErrors
-from dlo_calibration.planning.loads import ActionLoads
+from dlo_calibration.planning.action_loads import ActionLoads
 from dlo_calibration.planning.plan import Plan, PlannedAction
 
 LENGTH = 0.6  # m

@@ -4,6 +4,7 @@
 """A film shows how its camera sees the table, image by image, or says that it does not."""
 
 from dataclasses import replace
+import functools
 
 from films import Instant, plain_look, Renderer
 from laid_board import LaidBoard
@@ -18,13 +19,18 @@ SIZE = (800, 600)
 CAMERA = Camera(SIZE, 800.0, tilt=0.5, distance=0.75, target=(0.1, 0.1))
 LENS = Lens(SIZE, CAMERA.matrix, np.zeros(4))
 BOARD = LaidBoard((-0.05, -0.1))
-RENDERER = Renderer(plain_look(sheets=(BOARD.sheet,)), 0.004)
 PLACES = np.array([[-0.1, 0.25, 0.0], [0.1, 0.3, 0.0], [0.3, 0.1, 0.0]])
+
+
+@functools.cache
+def renderer():
+    """Return the renderer of the table, which takes a second to make."""
+    return Renderer(plain_look(sheets=(BOARD.sheet,)), 0.004, (-0.4, -0.4), (0.6, 0.6))
 
 
 def seen(camera=CAMERA, covered=0.0):
     """Return an image, in which an arm of skin colour covers a share of the board from the right."""
-    pixels = RENDERER.image([Instant(camera, None)])
+    pixels = renderer().image([Instant(camera, None)])
     corners = camera.project(np.array([[-0.05, -0.1, 0.0], [0.16, 0.2, 0.0]]))
     low, high = corners.min(axis=0).astype(int) - 20, corners.max(axis=0).astype(int) + 20
     left = int(high[0] - covered * (high[0] - low[0]))

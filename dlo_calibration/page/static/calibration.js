@@ -5,7 +5,7 @@
 
 import {advised, arrows} from './advice.js';
 import {h} from './dom.js';
-import {Film} from './film.js';
+import {Animation} from './animation.js';
 import {button, files, numeric, problem, warnings} from './parts.js';
 import {resultPanel} from './result.js';
 import {counted, duration, isComponent, number, words} from './words.js';
@@ -28,7 +28,7 @@ export class CalibrationStep {
 
   constructor(app) {
     this.app = app;
-    this.film = new Film(app);
+    this.animation = new Animation(app);
     app.project.addEventListener('change', () => this.#announce());
   }
 
@@ -276,11 +276,11 @@ export class CalibrationStep {
 
   drawn() {
     const {app} = this;
-    return [...this.film.drawn(), ...(app.player.playing ? [] : arrows(app, app.id))];
+    return [...this.animation.drawn(), ...(app.player.playing ? [] : arrows(app, app.id))];
   }
 
   player() {
-    return this.film.player();
+    return this.animation.player();
   }
 }
 

@@ -19,7 +19,7 @@ from dlo_calibration.capture.project import Project
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.result import Description
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.page.film import film_motion
+from dlo_calibration.page.animation import animated_motion
 from dlo_calibration.vision.film import Film
 from dlo_calibration.workspace.worker import Background, Failure
 
@@ -167,7 +167,7 @@ class FilmRoom:
         for k, own in enumerate(followed.trials):
             if k in entry.left_out:
                 continue
-            motion = film_motion(own.trial, description, make_simulator)
+            motion = animated_motion(own.trial, description, make_simulator)
             for instant, chain in zip(motion.times, motion.chains, strict=True):
                 shown = float(instant) + own.zero
                 scale = followed.scale_at(shown)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Film: the simulated motion of a trial, drawn over a photograph."""
+"""Animation: the simulated motion of a trial, drawn over a photograph."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.simulation.motion import Motion, simulated_motion
 from dlo_calibration.vision.scale import Scale
 
-PAUSE = 0.5  # s in the film between the last simulated instant and the DLO at rest
+PAUSE = 0.5  # s in the animation between the last simulated instant and the DLO at rest
 
 
-def film_motion(trial: Trial, description: Description, make_simulator: SimulatorFactory) -> Motion:
+def animated_motion(trial: Trial, description: Description, make_simulator: SimulatorFactory) -> Motion:
     """
     Simulate a trial with the parameters of a result; the last chain is compared with the goal.
 
@@ -34,7 +34,7 @@ def film_motion(trial: Trial, description: Description, make_simulator: Simulato
                   np.concatenate([motion.chains, motion.ends[-1:]]), motion.ends)
 
 
-def film(trial: Trial, motion: Motion, scale: Scale) -> dict[str, Any]:
+def animated(trial: Trial, motion: Motion, scale: Scale) -> dict[str, Any]:
     """
     Return a motion as the page shows it over a photograph.
 
