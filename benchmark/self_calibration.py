@@ -248,7 +248,8 @@ def main() -> None:
             f'{np.median(ratios):.2f}' if ratios else '-', f'{max(seconds):.1f}' if seconds else '-'))
     text = table(columns, rows)
     command = (f'python benchmark/self_calibration.py --objects {chosen.objects} --seeds {chosen.seeds}'
-               + f' --first {chosen.first}' * (chosen.first > 1) + ' --all-wanted' * chosen.all_wanted)
+               + f' --first {chosen.first}' * (chosen.first > 1) + ' --all-wanted' * chosen.all_wanted
+               + f' --robots {" ".join(chosen.robots)}' * (chosen.robots != parser.get_default('robots')))
     how = f'Wanted: {limits.wanted}; at most {MOST} trials. {machine()}'
     (HERE / 'results' / f'self_calibration{"_all" * chosen.all_wanted}.md').write_text(
         f'# self_calibration\n\n`{command}`\n\n{how}\n\n{text}\n', encoding='utf-8')
