@@ -181,8 +181,8 @@ def advised(setting: Setting, result: CalibrationResult) -> CalibrationResult:
         return result
     try:
         return replace(result, advice=advise(
-            result.trials, result.space, setting.pool, result.best.point,
-            result.examination.uncertainty, result.length))
+            result.trials, result.space, setting.pool, result.best.point, result.examination.uncertainty,
+            result.length, result.examination.noise))
     except CancelledError:
         return result
 

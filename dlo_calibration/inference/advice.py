@@ -4,41 +4,28 @@
 """
 Advice: the action to observe next, so that the least certain parameter becomes more certain.
 
-Each candidate is simulated with the found parameters and beside them.  The derivatives of the simulated
-chains, divided by the error of the residuals, give the information that the trial would add (the expected
-covariance of Bayesian experimental design: Chaloner and Verdinelli, Bayesian Experimental Design: A
-Review, 1995, section 2).
+It is chosen among actions that can be done with nearly any DLO, and said in words, by what each of them is
+expected to tell, see `expectation`.  Likewise, `workspace.next_action` seeks among what given hands may do.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import islice
-from operator import itemgetter
 from typing import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dlo_calibration.errors import InputError, SimulationError
-from dlo_calibration.evaluation.evaluation import with_hands
-from dlo_calibration.evaluation.linearisation import (
-    Differences,
-    information,
-    standard_deviations,
-    STEP,
-    WIDEST,
-)
+from dlo_calibration.errors import InputError
 from dlo_calibration.evaluation.pool import Pool
+from dlo_calibration.inference.draws import drawn_points
+from dlo_calibration.inference.expectation import Expectation
 from dlo_calibration.inference.together import CORRELATED
 from dlo_calibration.inference.uncertainty import DEVIATIONS, IDENTIFIABLE_WIDTH, Uncertainty
 from dlo_calibration.model.action import Action
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.named_actions import Drag, GraspAndPlace, LiftAndHold, NamedAction, TwoHands
 from dlo_calibration.model.parameters import BY_NAME, number, ParameterSpace, SCALE
-from dlo_calibration.model.score import force_residuals
 from dlo_calibration.model.trial import Goal, Trial
-from dlo_calibration.observation.excitation import excites
 
 MOST_SOUGHT = 6  # largest number of parameters for which an action is sought, to save time
 WORTH_IT = 0.8  # an advised action reduces the standard deviation to less than this share
@@ -83,119 +70,48 @@ class Advice:
 
 
 def advise(trials: Sequence[Trial], space: ParameterSpace, pool: Pool, point: Floats,
-           uncertainty: Uncertainty, length: float) -> Advice | None:
+           uncertainty: Uncertainty, length: float, noise: float = 0.0) -> Advice | None:
     """
-    Return the action that reduces the largest standard deviation most.
+    Return the action that is expected to tell most of the parameters that are not identifiable.
 
-    The parameters are tried from the least certain one on, until an action helps, the others are
-    identifiable, or actions were simulated for `MOST_SOUGHT` of them.  To save rollouts, only this parameter,
-    and what is known only together with it, is varied at first; the others are varied for the three best
-    actions alone.
+    To save time, there is one draw, near the found values, and only the least certain parameters are varied,
+    with what is known only together with them.
 
     :param point: (d,) the found values in the box.
     :param uncertainty: of the parameters now.
     :param length: of the DLO [m].
+    :param noise: noise level: standard deviation of one measured coordinate [m].
     :return: None if no action helps, every parameter is identifiable, or there is no covariance.
     :raises CancelledError: when stopped.
     """
-    if uncertainty.covariance is None:
+    std, enough = uncertainty.std, IDENTIFIABLE_WIDTH / 2 / DEVIATIONS
+    sought = np.argsort(-std, kind='stable')[:MOST_SOUGHT]
+    sought = sought[std[sought] > enough]
+    if uncertainty.correlations is None or not len(sought):
         return None
-    assert uncertainty.correlations is not None
-    correlations = uncertainty.correlations
-    possible, present = list(candidates(trials)), np.linalg.inv(uncertainty.covariance)
-
-    def derivatives(actions: Sequence[Candidate], varied: NDArray[np.bool_]
-                    ) -> list[Floats | SimulationError]:
-        return sensitivities([candidate.trial for candidate in actions], space, pool, point,
-                             uncertainty.std, length, shown=np.tile(varied, (len(actions), 1)))
-
-    sought: set[int] = set()
-    for k in np.argsort(-uncertainty.std, kind='stable').tolist():
-        now = float(uncertainty.std[k])
-        if 2 * DEVIATIONS * now <= IDENTIFIABLE_WIDTH or len(sought) == MOST_SOUGHT:
-            return None
-        # What is known only together with another parameter becomes certain by what shows either.
-        alone = np.abs(correlations[k]) >= CORRELATED
-        alone[k] = True
-        own = int(np.flatnonzero(alone).tolist().index(k))
-        deviations = uncertainty.std[alone]
-        before = np.linalg.inv(correlations[np.ix_(alone, alone)] * np.outer(deviations, deviations))
-        promising: list[tuple[float, Candidate, Floats]] = []
-        showing = [candidate for candidate in possible  # inf: a table may have any height
-                   if excites([candidate.trial], space, np.inf)[0, alone].any()]
-        if showing:
-            sought.add(k)
-        for candidate, column in zip(showing, derivatives(showing, alone), strict=True):
-            if isinstance(column, SimulationError):  # this DLO does not allow the action
-                possible.remove(candidate)
-                continue
-            # An upper bound of the gain: the other parameters count as known.
-            gained = information(column, uncertainty.scale)[np.ix_(alone, alone)]
-            at_best = float(standard_deviations(before + gained)[own])
-            if at_best < WORTH_IT * now:
-                promising.append((at_best, candidate, column))
-        best: tuple[float, Candidate] | None = None
-        promising = sorted(promising, key=itemgetter(0))[:3]
-        others = derivatives([candidate for _, candidate, _ in promising], ~alone)
-        for (_, candidate, column), rest in zip(promising, others, strict=True):
-            if not isinstance(rest, SimulationError):
-                std = float(standard_deviations(present + information(column + rest, uncertainty.scale))[k])
-                if std < WORTH_IT * now and (best is None or std < best[0]):
-                    best = std, candidate
-        if best is not None:
-            std, candidate = best
-            reach, end = DEVIATIONS * std, float(space.upper[k])
-            return Advice(candidate.action, candidate.words, space.free[k], now, std,
-                          max(0.0, float(point[k]) - reach), min(end, float(point[k]) + reach))
+    # What is known only together with another parameter becomes certain by what shows either.
+    varied = np.asarray((np.abs(uncertainty.correlations[sought]) >= CORRELATED).any(axis=0))
+    possible = list(candidates(trials))
+    expectation = Expectation.of(
+        [candidate.trial for candidate in possible], space, pool,
+        drawn_points(point, uncertainty, 1, 0), uncertainty, uncertainty.scale, length,
+        np.full(len(std), enough), noise, varied)
+    for k in expectation.ranked:
+        expected = expectation.expected(k)
+        most = int(sought[np.argmin((expected / std)[sought])])
+        if expected[most] < WORTH_IT * std[most]:
+            reach = DEVIATIONS * float(expected[most])
+            return Advice(possible[k].action, possible[k].words, space.free[most], float(std[most]),
+                          float(expected[most]), max(0.0, float(point[most]) - reach),
+                          min(float(space.upper[most]), float(point[most]) + reach))
     return None
-
-
-def sensitivities(trials: Sequence[Trial], space: ParameterSpace, pool: Pool, point: Floats, std: Floats,
-                  length: float, *, shown: NDArray[np.bool_], at_rest: bool = True,
-                  recorded: bool = False) -> list[Floats | SimulationError]:
-    """
-    Return the (m, d) derivatives of the simulated chains, and then forces, of each trial [m per unit].
-
-    The central differences have steps of the standard deviations, because the chains may be nonlinear within
-    such a distance.
-
-    :param std: (d,) standard deviations in units of a search.
-    :param length: of the DLO [m].
-    :param shown: (trials, d) False for parameters that a trial cannot show: their columns are zero without a
-        rollout.
-    :param at_rest: whether to refuse a rollout that does not come to rest; if not, its last state counts.
-    :param recorded: whether the hands of the trials have the errors of their parameters; those of planned
-        trials have none.
-    :return: for a trial without derivatives the reason: a rollout diverges, or does not come to rest.
-    :raises CancelledError: when stopped.
-    """
-    steps = np.clip(std, STEP, WIDEST)
-    sides = [Differences.central(point, np.flatnonzero(row), steps, space.upper) for row in shown]
-    jobs = []
-    for trial, differences in zip(trials, sides, strict=True):
-        for beside in differences.points:
-            physical = space.physical(space.values(beside), length)
-            jobs.append((with_hands(trial, physical) if recorded else trial, physical))
-    rollouts = iter(pool.simulate(jobs))
-    derivatives: list[Floats | SimulationError] = []
-    for trial, differences in zip(trials, sides, strict=True):
-        chains, failure = [], None
-        for rollout in islice(rollouts, len(differences.points)):
-            if isinstance(rollout, SimulationError):
-                failure = rollout
-            elif at_rest and not all(rollout.settled):
-                failure = SimulationError(f'trial {trial.name!r} does not come to rest')
-            else:
-                chains.append(np.append(rollout.chains, force_residuals(trial, rollout.forces)))
-        count = len(trial.goals) * len(trial.initial) + len(trial.forces)
-        unknown = np.zeros((3 * count, len(point)))
-        derivatives.append(differences.jacobian(unknown, chains) if failure is None else failure)
-    return derivatives
 
 
 def candidates(trials: Sequence[Trial]) -> Iterator[Candidate]:
     """Yield actions that could be observed next, starting from the initial chain of a trial."""
     chain = next((trial.initial for trial in trials if trial.velocity is None), trials[0].initial)
+    if not chain.seen.all():
+        chain = chain.interpolated(chain.arc_lengths())
     length = chain.length
     along = chain.points[-1] - chain.points[0]
     across = np.array([-along[1], along[0], 0.0])

@@ -172,14 +172,16 @@ def extended(fit: Linearisation, uncertainty: Uncertainty, residuals_at: Evaluat
 
     The effect of a stiffness fades as it grows: one end of an interval may fit clearly worse, the other not.
     An end whose effect is below 90 % of the expected one moves to twice its distance, four times at most;
-    after that, it is the end of the scale.  The standard deviations grow with the intervals.
+    after that, it is the end of the scale.  From where the effect is larger than expected, it moves back.
+    The standard deviations grow with the intervals.
     """
     point, ends = fit.point, np.stack([uncertainty.lower, uncertainty.upper])
     limits = np.stack([np.zeros(len(point)), np.broadcast_to(fit.upper, len(point))])
     excited = np.flatnonzero(uncertainty.excited)
-    needed = DEVIATIONS * uncertainty.std * 0.9
+    expected = DEVIATIONS * uncertainty.std
     unsure = [(side, int(k)) for k in excited for side in (0, 1)
               if uncertainty.std[k] > SUSPECT and ends[side, k] != limits[side, k] and fading[k]]
+    short: dict[tuple[int, int], tuple[float, float]] = {}  # where the effect is too small, and how large
     for _ in range(4):
         if not unsure:
             break
@@ -191,10 +193,15 @@ def extended(fit: Linearisation, uncertainty: Uncertainty, residuals_at: Evaluat
             if residuals is None:
                 continue
             own = fit.columns(excited).own_weights(int(np.searchsorted(excited, k)))
-            if abs(float(own @ (residuals - fit.residuals))) < needed[k]:
-                ends[side, k] = np.clip(2 * ends[side, k] - point[k], *limits[:, k])
-                if ends[side, k] != limits[side, k]:
-                    moved.append((side, k))
+            end, effect = float(ends[side, k]), abs(float(own @ (residuals - fit.residuals)))
+            if effect >= 0.9 * expected[k]:
+                if (side, k) in short:
+                    near, small = short[side, k]
+                    ends[side, k] -= (end - near) * max(0.0, (effect - expected[k]) / (effect - small))
+            elif end != limits[side, k]:
+                short[side, k] = end, effect
+                ends[side, k] = np.clip(2 * end - point[k], *limits[:, k])
+                moved.append((side, k))
         unsure = moved
     for side, k in unsure:
         ends[side, k] = limits[side, k]

@@ -21,6 +21,7 @@ import numpy as np
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.evaluation.evaluation import with_hands
 from dlo_calibration.evaluation.linearisation import (
+    Differences,
     information,
     Linearisation,
     standard_deviations,
@@ -29,7 +30,6 @@ from dlo_calibration.evaluation.linearisation import (
 )
 from dlo_calibration.evaluation.pool import Pool
 from dlo_calibration.evaluation.residuals import Huber, ResidualLayout
-from dlo_calibration.inference.advice import sensitivities
 from dlo_calibration.inference.draws import drawn_points
 from dlo_calibration.inference.examination import Examination, extended
 from dlo_calibration.inference.outlier import candidate, is_outlier, SOMETHING_ELSE
@@ -54,7 +54,7 @@ from dlo_calibration.model.parameters import (
     REST_SHAPE,
     SCALE,
 )
-from dlo_calibration.model.score import distances, force_residuals, residuals, seen_points
+from dlo_calibration.model.score import distances, force_residuals, residuals
 from dlo_calibration.model.trial import Goal, shown_goals, Trial
 from dlo_calibration.observation.excitation import excites
 from dlo_calibration.observation.noise import NO_NOISE, with_other_noise
@@ -226,6 +226,14 @@ class Appraisal:
         return (f'{trials[k].name} does not fit the others: {measured(float(errors[k]), "m")} from what they '
                 f'predict, where they miss {measured(usual, "m")}; {SOMETHING_ELSE}: repeat it')
 
+    @property
+    def promised(self) -> Floats:
+        """The standard deviations, (d,), if the models were linear, and the only errors white ones."""
+        if not self.models:
+            return self.uncertainty.std
+        told = sum((model.fit.information for model in self.models), np.zeros(2 * (len(self.point),)))
+        return standard_deviations(told / self.uncertainty.scale**2 + prior_information(len(self.point)))
+
     @classmethod
     def before(cls, names: tuple[str, ...], point: Floats) -> Appraisal:
         """Return the appraisal before any simulation, at a (d,) point to begin from."""
@@ -381,6 +389,8 @@ class Appraiser:
     def _examined(self, names: tuple[str, ...], trials: Sequence[Trial], point: Floats,
                   models: tuple[TrialModel, ...]) -> Appraisal:
         fit, layout = _joint_model(models, trials, point)
+        here = self._residuals(trials, point)  # where a trial is nonlinear, its model is off
+        fit = fit if here is None else replace(fit, residuals=here)
         shift = optimum_shift(fit, fit.residuals + np.concatenate([model.finer for model in models]))
         starts = fit.residuals + np.hstack([model.moved for model in models])
         uncertainty = at_minimum(fit, layout, noise=self.noise, shift=shift, starts=starts)
@@ -397,21 +407,32 @@ class Appraiser:
             return None
 
     def _simulated(self, trial: Trial, point: Floats, pool: Pool | None = None) -> Floats:
-        physical = self.space.physical(self.space.values(point), self.length)
-        rollout, = (pool or self.pool).simulate([(with_hands(trial, physical), physical)])
-        if isinstance(rollout, SimulationError):
-            raise rollout
-        return np.append(residuals(trial, rollout.chains), force_residuals(trial, rollout.forces))
+        here, = self._all_simulated(trial, point[None], pool)
+        return here
+
+    def _all_simulated(self, trial: Trial, points: Floats, pool: Pool | None = None) -> list[Floats]:
+        """
+        Return the residuals (m,) [m] of a trial at each of (n, d) points.
+
+        :raises SimulationError: if the trial cannot be simulated.
+        """
+        values = [self.space.physical(self.space.values(point), self.length) for point in points]
+        rollouts = (pool or self.pool).simulate(
+            [(with_hands(trial, physical), physical) for physical in values])
+        failure = next((rollout for rollout in rollouts if isinstance(rollout, SimulationError)), None)
+        if failure is not None:
+            raise failure
+        return [np.append(residuals(trial, rollout.chains), force_residuals(trial, rollout.forces))
+                for rollout in rollouts if not isinstance(rollout, SimulationError)]
 
     def _model(self, trial: Trial, point: Floats, std: Floats) -> TrialModel:
         """Simulate a trial around a (d,) point; a parameter that it certainly cannot show is not varied."""
-        shown, here = excites([trial], self.space, self.table_height)[0], self._simulated(trial, point)
-        jacobian, = sensitivities([trial], self.space, self.pool, point, std, self.length,
-                                  shown=shown[None], at_rest=False, recorded=True)
-        if isinstance(jacobian, SimulationError):
-            raise jacobian
-        rows = np.repeat(np.append(seen_points(trial), np.ones(len(trial.forces), bool)), 3)
-        return TrialModel(Linearisation(point, here, jacobian[rows], self.space.upper),
+        here, shown = self._simulated(trial, point), excites([trial], self.space, self.table_height)[0]
+        # Steps of the standard deviations, as the chains may be nonlinear within such a distance.
+        sides = Differences.central(point, np.flatnonzero(shown), np.clip(std, STEP, WIDEST),
+                                    self.space.upper)
+        jacobian = sides.jacobian(np.zeros((len(here), len(point))), self._all_simulated(trial, sides.points))
+        return TrialModel(Linearisation(point, here, jacobian, self.space.upper),
                           np.zeros((STARTS, len(here))), np.zeros(len(here)))
 
     def _completed(self, model: TrialModel, trial: Trial) -> TrialModel:

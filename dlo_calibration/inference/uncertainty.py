@@ -427,9 +427,14 @@ def optimum_shift(fit: Linearisation, finer: Floats) -> Floats:
     """
     Return (d,): how far the optimum moves if a finer simulation gives the residuals `finer`, (m,) [m].
 
-    This is a Gauss-Newton step on the difference; no parameter moves further than a unit.
+    This is a Gauss-Newton step on the difference; no parameter moves further than a unit.  The residuals
+    contain what the step leaves of the difference: more of it comes from chaos, so that the step is shorter
+    by as much.
     """
-    return np.clip(replace(fit, residuals=finer - fit.residuals).step(fit.ridge), -1.0, 1.0)
+    difference = replace(fit, residuals=finer - fit.residuals)
+    step = difference.step(fit.ridge)
+    left = float(np.linalg.norm(difference.predicted(step)))
+    return np.clip(step * min(1.0, float(np.linalg.norm(fit.residuals)) / max(left, TINY)), -1.0, 1.0)
 
 
 def predictive_std(jacobian: Floats, covariance: Floats) -> Floats:

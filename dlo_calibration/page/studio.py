@@ -11,9 +11,12 @@ from pathlib import Path
 import threading
 from typing import Any, Mapping
 
+import numpy as np
+
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.capture.document import Document, FilmEntry
+from dlo_calibration.calibration.result import with_nulls
+from dlo_calibration.capture.document import BoardScale, Document, FilmEntry
 from dlo_calibration.capture.hands import described
 from dlo_calibration.capture.obstacles import scene_document
 from dlo_calibration.capture.project import Project, SCENE
@@ -29,15 +32,21 @@ from dlo_calibration.page.calibration import ProjectCalibration
 from dlo_calibration.page.film_room import FilmRoom
 from dlo_calibration.page.graph import PageGraph
 from dlo_calibration.page.information import Information
+from dlo_calibration.planning.limits import HANDS
+from dlo_calibration.planning.options import AdviceOptions
 from dlo_calibration.simulation.motion import Motion
+from dlo_calibration.vision.board import COLUMNS, ROWS, SQUARE
 from dlo_calibration.vision.observer import jpeg_of
 from dlo_calibration.vision.photograph import jpeg, png
+from dlo_calibration.vision.scale import Scale
 from dlo_calibration.workspace.check import checked
 from dlo_calibration.workspace.folder import FILES, REQUEST, RESULT, SESSION
 from dlo_calibration.workspace.source import read_source, Selection
 from dlo_calibration.writing import make_folder, write_file
 
 MOST_ANIMATIONS = 8  # in memory
+LIFT = 0.1  # m, of an advised movement
+STILL = 1e-3  # m; a hand that moves less along the table goes up or down, or waits
 CHAIN_FILES = {'csv': chain_csv, 'xml': chain_xml}
 
 
@@ -81,7 +90,7 @@ class Studio:
                                     'result': self._calibration.plain_result(self._drafts.digest)},
                     'films': {entry.id: self._film_room.plain(entry)
                               for entry in self.project.document.films},
-                    'lens': self.project.lens_name, 'ros': self._graph is not None,
+                    'advice': self._advice(), 'lens': self.project.lens_name, 'ros': self._graph is not None,
                     'actions': described(), 'folder': str(self.project.folder),
                     'warnings': self.project.warnings}
 
@@ -316,7 +325,7 @@ class Studio:
                 self._calibration.written.clear()
                 news.append('state')
             if not self._calibration.busy and self._information.take():
-                news.append('information')
+                news += ['information', 'advice']
             return tuple(dict.fromkeys(news))
 
     def films(self) -> list[dict[str, Any]]:
@@ -324,6 +333,11 @@ class Studio:
         with self._lock:
             return [{'id': entry.id, 'progress': progress} for entry in self.project.document.films
                     if (progress := self._film_room.progress(entry.id)) is not None]
+
+    def advice(self) -> dict[str, Any]:
+        """Return what to do next, as far as it is known."""
+        with self._lock:
+            return {'advice': self._advice()}
 
     def information(self) -> list[dict[str, Any]]:
         """Return the information of each trial, as far as it is known, with its number from 0."""
@@ -354,7 +368,8 @@ class Studio:
             trials = [draft.trial for draft in self._newest.trials if draft.trial is not None]
             with suppress(InputError):  # a calibration is refused with the reason
                 self._write_scene(self.project.folder)
-            self._information.want(trials, self._options({}), digest(*self._newest.obstacles))
+            self._information.want(trials, self._options({}), digest(*self._newest.obstacles),
+                                   self._limits())
         return self._newest
 
     def _with_films(self, drafts: Drafts) -> Drafts:
@@ -368,6 +383,53 @@ class Studio:
                  for k, draft in enumerate(filmed)]
         return replace(drafts, trials=(*drafts.trials, *named),
                        filmed_diameter=2.0 * self._film_room.radius or None)
+
+    def _last_view(self, drafts: Drafts) -> tuple[str, Scale] | None:
+        """Return the id of the photograph or film that ends the last trial, and its scale; None: unknown."""
+        if not drafts.trials or drafts.trials[-1].trial is None:
+            return None
+        for entry in reversed(self.project.document.films):
+            followed = self._film_room.followed.get(entry.id)
+            used = [own for k, own in enumerate(followed.trials if followed else ())
+                    if k not in entry.left_out]
+            if used and followed is not None:
+                scale = followed.scale_at(used[-1].zero + used[-1].trial.goals[-1].time)
+                return None if scale is None else (entry.id, scale)
+        goal = self.project.document.trials[-1].goal or ''
+        scale = drafts.photographs[goal].scale if goal in drafts.photographs else None
+        return None if scale is None else (goal, scale)
+
+    def _limits(self) -> AdviceOptions | None:
+        """Return what a person's hand may do next: what the last picture shows, and not on the board."""
+        view = None if self._newest is None else self._last_view(self._newest)
+        if view is None:
+            return None
+        width, height = view[1].size
+        corners = view[1].points([(u, v) for u in (0.0, width - 1.0) for v in (0.0, height - 1.0)])
+        low, high = corners[:, :2].min(axis=0), corners[:, :2].max(axis=0)
+        reach = '' if np.isnan(corners).any() else \
+            f'box {low[0]:.3f} {low[1]:.3f} -1 {high[0]:.3f} {high[1]:.3f} 1'
+        boards = any(isinstance(entry.scale, BoardScale) for entry in self.project.document.photographs)
+        return AdviceOptions(height=LIFT, pause=0.0, reach_1=reach, no_go=(
+            f'0 0 -1 {COLUMNS * SQUARE:.3f} {ROWS * SQUARE:.3f} 0.01',) * boards)
+
+    def _advice(self) -> dict[str, Any] | None:
+        """
+        Return what to do next as the page shows it; None: it is not known yet.
+
+        :returns: `words`; `view`: the id of the photograph or film on which it is drawn; `ways`: for each
+            hand, its pixels on the table, from where it grips to where it opens.
+        """
+        advice, view = self._information.advice, self._last_view(self._drafts)
+        if advice is None or view is None:
+            return None
+        ways = []
+        for hand in () if advice.action is None else advice.action.hands:
+            flat = np.column_stack([hand.positions[:, :2], np.full(len(hand.times), hand.positions[0, 2])])
+            turns = np.append(True, np.linalg.norm(np.diff(flat, axis=0), axis=1) > STILL)
+            ways.append(np.round(view[1].to_pixels(flat[turns]), 1).tolist())
+        said = advice.words.removeprefix(f'{HANDS[0]}: ')
+        return {'words': said[:1].upper() + said[1:], 'view': view[0], 'ways': with_nulls(ways)}
 
     def _entry(self, identity: str) -> FilmEntry:
         """

@@ -29,7 +29,6 @@ SPREAD = 0.06  # of the length: standard deviation of a change of a displacement
 GRASPED = 0.6  # least share of the points that some hand reaches after an action
 HEAP = 0.3  # share of the length; a DLO whose points are all nearer to each other lies in a heap
 SELDOM = 0.25  # share of the draws in which an action may end otherwise
-GRIP_ERROR = 3e-3  # m along the DLO: standard deviation of where robots and people grip
 STEADY = 0.25  # s before the end of a pause, when hands and DLO rest
 TIDIER = 0.8  # of the distance from where it is tidy that an action must leave, at most
 
@@ -40,14 +39,12 @@ class Inquiry:
     A move, the paths of its hands with a pause, and its trial, whose goals are placeholders.
 
     :param pause: when the hands wait, (begin, end) [s]; None: they do not.
-    :param slips: for each hand, the trial in which it grips GRIP_ERROR beside where it thinks.
     """
 
     move: Move
     action: Action
     pause: tuple[float, float] | None
     trial: Trial
-    slips: tuple[Trial, ...]
 
     def words(self, start: Chain) -> str:
         """Say what the hands do: `start` is the DLO before."""
@@ -60,7 +57,8 @@ class Inquiry:
             what = f'drag it by {100 * way:.0f} cm' if kind != LIFTING else \
                 f'lift it by {100 * lift:.0f} cm' + (f' and carry it by {100 * way:.0f} cm'
                                                      if way > 0.005 else '')
-            end = {0: 'the first end', len(places) - 1: 'the last end'}
+            end = {0: 'the first end', int(np.abs(places - 0.5).argmin()): 'the middle',
+                   len(places) - 1: 'the last end'}
             parts.append(f'{name}: grip {end.get(grip, f"{places[grip]:.2f} of the length")}, {what}')
         wait = '' if self.pause is None else f'; wait for {self.pause[1] - self.pause[0]:.3g} s, in which ' \
             'the DLO is observed'
@@ -159,8 +157,7 @@ class Inquiries:
             action, waits = self._paths(chosen, self.limits.pause if pause is None else pause)
             refusal = (self._regions.refusal(action) or clash(action) or self._surroundings.refusal(action))
             if not refusal:
-                return Inquiry(chosen, action, waits, self._trial(action, waits), tuple(
-                    self._trial(self._slipped(action, k), waits) for k in range(count)))
+                return Inquiry(chosen, action, waits, self._trial(action, waits))
             self.refusals[refusal] = self.refusals.get(refusal, 0) + 1
         return None
 
@@ -178,16 +175,6 @@ class Inquiries:
         later = np.array([0.0] * (at + 1) + [pause] * (count - at))
         return Action(tuple(Hand(hand.name, hand.grips, hand.times[rows] + later, hand.positions[rows])
                             for hand in action.hands)), (begin, begin + pause)
-
-    def _slipped(self, action: Action, k: int) -> Action:
-        """Return an action in which hand k does the same way, but grips nearer to the middle of the DLO."""
-        hand, places = action.hands[k], self.start.arc_lengths()
-        grip, = hand.grips
-        side = 1 if grip < len(places) / 2 else -1
-        offset = side * min(1.0, GRIP_ERROR / abs(float(places[grip + side] - places[grip])))
-        away = self.start.gripped(hand.grips, offset)[0] - hand.positions[0]
-        slipped = replace(hand, offset=offset, positions=hand.positions + away)
-        return Action((*action.hands[:k], slipped, *action.hands[k + 1:]))
 
     def _trial(self, action: Action, pause: tuple[float, float] | None) -> Trial:
         goals = [Goal(self.start, action.end + REST)]

@@ -35,13 +35,13 @@ from dlo_calibration.planning.surroundings import Surroundings
 from dlo_calibration.workspace.live_information import appraise, Appraised
 
 NODES, TIME_STEP = 21, 0.004  # of the simulation that seeks; a coarse one tells the actions apart
-FEW, MANY = 4, 8  # draws that all actions, and that the best ones, are simulated with
+FEW, MANY = 4, 6  # draws that all actions, and that the best ones, are simulated with
 BEST = 3  # actions whose displacements are refined
 BESIDE = 4  # displacements that are tried beside each of them
 TRIED = 4  # actions at a time that are checked against the limits
 ERRORS = 3.0  # times the noise, that the chains before and after an action, and grips, have together
 MODEL_ERROR = 5e-3  # share of the length by which a simulation with the right parameters misses, likewise
-LEAST_TRUST = 0.1  # in derivatives, where trials gave only a bound, wider than a linear model says
+LEAST_TRUST = 0.1  # in derivatives, where trials told less than a linear model with white errors says
 LEAST_TRIALS = 2  # one alone does not show what differs from trial to trial, such as errors of grips
 TOLD_AFTER = 2  # trials after which a parameter that no action shows is given up
 CLEAR = 0.25  # of a standard deviation that a single action must leave at most
@@ -167,12 +167,10 @@ class _Seeker:
         self._count, self._seed = len(appraised.trials), options.seed
         start = inquiries.start
         self._length = mean_length(appraised.trials) if appraised.trials else start.length
-        known = self._uncertainty
-        local = known.std**2 if known.local is None else np.diag(known.local)
-        bound = (known.lower <= 0) | (known.upper >= known.ends)
-        self._trust = np.where(bound, np.clip(np.sqrt(local) / known.std, LEAST_TRUST, 1.0), 1.0)
-        level = noise_of([start.points[None]])
-        self._scale = float(np.hypot(ERRORS * np.nan_to_num(level), MODEL_ERROR * self._length))
+        # The next trial is as likely to resemble those so far in this as not: half of it, in logarithms.
+        self._trust = np.clip(appraised.appraisal.promised / self._uncertainty.std, LEAST_TRUST**2, 1.0)**0.5
+        self._noise = float(np.nan_to_num(noise_of([start.points[None]])))
+        self._scale = float(np.hypot(ERRORS * self._noise, MODEL_ERROR * self._length))
         self._draws = [self._space.physical(self._space.values(point), self._length)
                        for point in self._points(FEW)]
 
@@ -182,7 +180,7 @@ class _Seeker:
     def _expectation(self, inquiries: Sequence[Inquiry], count: int, wanted: Floats) -> Expectation:
         return Expectation.of([inquiry.trial for inquiry in inquiries], self._space, self._pool,
                               self._points(count), self._uncertainty, self._scale, self._length, wanted,
-                              [inquiry.slips for inquiry in inquiries], self._trust)
+                              self._noise, trust=self._trust, finer=self._pool.refined())
 
     def found(self) -> NextAction:
         """Return the next action."""
@@ -194,7 +192,7 @@ class _Seeker:
         if self._count < MOST_TRIALS:
             far &= then > SHOWN * nothing.std
         # What earlier trials left unknown, though they promised to show some of it, needs a clear view.
-        single = expectation.deviations(expectation.informations[expectation.possible]).mean(axis=1)
+        single = np.array([expectation.expected(k) for k in np.flatnonzero(expectation.possible).tolist()])
         far |= self._uncertainty.unknown & (nothing.std > wanted) & (
             single.min(axis=0, initial=np.inf) > CLEAR * nothing.std)
         if self._count >= TOLD_AFTER and far.any():
@@ -233,8 +231,7 @@ class _Seeker:
                       for other in self._inquiries.beside(inquiry, BESIDE * BEST // best, generator)]
             more = self._expectation(others, MANY, wanted)
             tried += others
-            expectation = replace(expectation, informations=np.concatenate(
-                [expectation.informations, more.informations]))
+            expectation = expectation.with_others(more)
         return tried, expectation
 
     def _permitted(self, ranked: Sequence[Inquiry]) -> list[Inquiry]:

@@ -8,9 +8,10 @@ from functools import partial
 import numpy as np
 import pytest
 
-from dlo_calibration.evaluation.linearisation import STEP, WIDEST
+from dlo_calibration.evaluation.linearisation import Linearisation, STEP, WIDEST
 from dlo_calibration.evaluation.residuals import ResidualLayout
-from dlo_calibration.inference.examination import examine, SHORTEST
+from dlo_calibration.inference.examination import examine, extended, SHORTEST
+from dlo_calibration.inference.uncertainty import DEVIATIONS, Uncertainty
 from dlo_calibration.model.score import PointErrors
 
 LAYOUT = ResidualLayout(((1, 20), (2, 20), (1, 20)))
@@ -229,6 +230,23 @@ def test_an_interval_reaches_to_where_the_effect_has_really_changed():
     assert uncertain.upper[0] < TRUTH[0] + 1.7 * uncertain.std[0]
     width, certain_width = (each.upper[1] - each.lower[1] for each in (uncertain, certain))
     assert width == pytest.approx(certain_width, rel=0.1)
+
+
+def test_an_interval_ends_where_the_effect_is_as_large_as_expected():
+    """The effect begins beyond a dead zone of a quarter of the first half width."""
+    column = np.random.default_rng(1).normal(0, 1, ROWS)
+    fit = Linearisation(np.array([0.5]), np.zeros(ROWS), column[:, None])
+    half = DEVIATIONS * 0.04
+    given = Uncertainty(np.array([0.04]), np.array([0.5 - half]), np.array([0.5 + half]), np.array([True]),
+                        np.array([False]))
+
+    def residuals_at(points):
+        away = points[:, 0] - 0.5
+        return list((np.sign(away) * np.maximum(np.abs(away) - half / 4, 0.0))[:, None] * column)
+
+    found = extended(fit, given, residuals_at, np.array([True]))
+    assert found.upper - 0.5 == pytest.approx([1.25 * half])
+    assert 0.5 - found.lower == pytest.approx([1.25 * half])
 
 
 def test_intervals_of_a_linear_model_stay_as_they_are():

@@ -297,6 +297,15 @@ def test_an_interval_contains_the_optimum_of_a_finer_simulation():
     assert uncertainty.std[1] < 0.02
 
 
+def test_a_finer_simulation_that_leads_elsewhere_by_chance_moves_the_optimum_little():
+    jacobian, generator = linear_model(), np.random.default_rng(6)
+    _, residuals = fitted(jacobian, generator.normal(0, 1e-3, ROWS))
+    fit = Linearisation(POINT, residuals, jacobian)
+    chaos = generator.normal(0, 0.1, ROWS)
+    whole = np.linalg.lstsq(jacobian, -chaos, rcond=None)[0]
+    assert np.linalg.norm(optimum_shift(fit, residuals + chaos)) < 0.02 * np.linalg.norm(whole)
+
+
 def test_other_noise_of_the_initial_chains_widens_an_interval_by_what_it_moves():
     jacobian = linear_model(columns=1)
     residuals = np.random.default_rng(9).normal(0, 1e-3, ROWS)

@@ -139,17 +139,24 @@ def whole_trial(page):
 
 
 class ToyInformation:
-    """An appraiser that knows at once what each trial adds, and remembers what it was asked."""
+    """
+    An appraiser that knows at once what each trial adds, and remembers what it was asked.
+
+    :cvar advice: what it says of what to do next; None: nothing.
+    """
+
+    advice = None
 
     def __init__(self, make_simulator=None):
         self.started, self.stopped, self.alive, self.waiting, self._done = [], 0, False, [], []
 
-    def start(self, trials, options):
+    def start(self, trials, options, then=None):
         done, self._done = self._done, [trial.name for trial in trials]
         self.started.append(self._done)
         names = options.space.free
         self.waiting += [TrialInformation(name, names, np.full(len(names), 0.3), np.full(len(names), 0.06))
                          for name in self.started[-1] if name not in done]
+        self.waiting += [self.advice] * (then is not None and self.advice is not None)
 
     def stop(self):
         self.stopped += 1
@@ -158,7 +165,7 @@ class ToyInformation:
     def join(self, timeout=None):
         return not self.alive
 
-    def waiting_information(self):
+    def waiting_events(self):
         reported, self.waiting = self.waiting, []
         yield from reported
 

@@ -3,6 +3,7 @@
 
 /** Step 5: the information of the trials, the calibration, its result, and the film. */
 
+import {advised, arrows} from './advice.js';
 import {h} from './dom.js';
 import {Animation} from './animation.js';
 import {button, files, numeric, problem, warnings} from './parts.js';
@@ -70,8 +71,8 @@ export class CalibrationStep {
     );
     const check = busy ? null : this.#check();
     return calibration.result && !busy
-      ? [resultPanel(this, calibration), start, check, trials]
-      : [trials, start, check];
+      ? [resultPanel(this, calibration), advised(app, app.id), start, check, trials]
+      : [busy ? null : advised(app, app.id), trials, start, check];
   }
 
   #check() {
@@ -274,7 +275,8 @@ export class CalibrationStep {
   }
 
   drawn() {
-    return this.animation.drawn();
+    const {app} = this;
+    return [...this.animation.drawn(), ...(app.player.playing ? [] : arrows(app, app.id))];
   }
 
   player() {

@@ -3,6 +3,7 @@
 
 /** A film: clicks along the DLO, the line that follows it, its trials, and the simulated DLO over it. */
 
+import {advised, arrows} from './advice.js';
 import {h} from './dom.js';
 import {line} from './line.js';
 import {button, legend, mark, numeric, problem, tick} from './parts.js';
@@ -147,6 +148,7 @@ export class FilmStep {
         }),
       ),
       progress || seen.waiting ? this.#progress(progress) : null,
+      advised(app, this.id),
       seen.trials ? this.#outcome(seen, entry) : null,
       h(
         'details',
@@ -290,6 +292,7 @@ export class FilmStep {
     return [
       ...pieces(pixels).map((piece, k) => line(piece, seen.outdated ? 'before' : 'sure', `piece${k}`)),
       simulated ? line(simulated, 'simulated', 'simulated') : null,
+      ...(this.time >= (seen.trials?.at(-1)?.end ?? 0) ? arrows(this.app, this.id) : []),
       ...(here < 0 ? [] : entry.marks[here].clicks).map((at, k) =>
         mark({
           name: `click ${k}`,

@@ -3,6 +3,7 @@
 
 /** Step 1, photographs: their files, and the start and goal of each trial. */
 
+import {advised} from './advice.js';
 import {openCamera} from './camera.js';
 import {HANGING} from './clamps.js';
 import {h} from './dom.js';
@@ -143,6 +144,7 @@ export class PhotographsStep {
         ),
         problem(this.app.project, PLACE),
       ),
+      advised(this.app),
       films.length
         ? h(
             'section',

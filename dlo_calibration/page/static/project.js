@@ -42,6 +42,11 @@ export class Project extends EventTarget {
         this.state.trials[trial].information = information.information ?? information;
       this.#changed();
     });
+    events.addEventListener('advice', (event) => {
+      if (!this.state) return;
+      this.state.advice = JSON.parse(event.data).advice;
+      this.#changed();
+    });
     events.addEventListener('films', (event) => {
       const {id, progress} = JSON.parse(event.data);
       if (this.state?.films[id]) this.state.films[id].progress = progress;
