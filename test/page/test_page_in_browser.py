@@ -21,7 +21,9 @@ from capture_page import (
     whole_trial,
 )
 import cv2
+import hung_loops
 import numpy as np
+from PIL import Image
 import pytest
 
 from dlo_calibration.files.session import samples
@@ -167,6 +169,30 @@ def test_a_whole_trial_from_upload_to_result(opened, empty, tmp_path):
     with tab.page.expect_download() as download:
         tab.find('a[href$="session.mcap"]').click()
     assert download.value.path().stat().st_size > 1000
+    assert {step: faults for step, faults in violations.items() if faults} == {}
+
+
+def test_one_photograph_of_a_loop_that_hangs_is_a_trial(opened, empty, tmp_path):
+    camera, (shape, ends) = hung_loops.view(), hung_loops.loop()
+    Image.fromarray(hung_loops.picture(camera)).save(tmp_path / 'loop.png', compress_level=1)
+    tab = opened()
+    tab.find('input[type=file]').first.set_input_files([tmp_path / 'loop.png'])
+    tab.find('.photographs li').first.wait_for()
+    tab.field('It hangs between two clamps').click()
+    tab.button('Next: Scale').click()
+    tab.field('Length of the DLO').fill(str(1e3 * hung_loops.LENGTH))
+    for k, clamp in enumerate(hung_loops.pixels(camera, ends + 2 * (ends - shape[[0, -1]]))):
+        tab.click(clamp)
+        tab.mark(f'clamp {k}').wait_for()
+    violations = {'scale': tab.violations()}
+    tab.button('Next: DLO').click()
+    tab.clicked(hung_loops.pixels(camera, shape[[0, 100, 200, -1]]))
+    tab.find('.line.sure').first.wait_for()
+    violations['DLO'] = tab.violations()
+    tab.step('Calibrate')
+    tab.button('Calibrate').last.click()
+    tab.find('table.result').wait_for()
+    tab.find('.line.simulated polyline').first.wait_for()
     assert {step: faults for step, faults in violations.items() if faults} == {}
 
 

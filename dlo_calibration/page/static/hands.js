@@ -25,7 +25,9 @@ export class HandsStep {
   }
 
   what() {
-    return 'Describe what the hand did: where it gripped the DLO, how it moved, and where it opened.';
+    return this.app.hangs(this.app.entry)
+      ? 'No hand moves in this trial: the DLO hangs between two clamps.'
+      : 'Describe what the hand did: where it gripped the DLO, how it moved, and where it opened.';
   }
 
   /** List [trial, role] without a movement of a hand. */
@@ -93,8 +95,7 @@ export class HandsStep {
     const {app} = this;
     const {entry} = app;
     if (!entry) return [h('p', {}, 'There is no trial yet: add photographs in step 1.')];
-    if (app.hangs(entry))
-      return [h('p', {}, 'No hand moves in this trial: the DLO hangs between two clamps.'), warnings(app, 3)];
+    if (app.hangs(entry)) return [warnings(app, 3)];
     const {steps} = entry;
     if (!steps.length || this.adding) return [...this.#list(steps.length), problem(app.project, PLACE)];
     this.chosen = Math.min(this.chosen, steps.length - 1);

@@ -29,7 +29,9 @@ export class ScaleStep {
   }
 
   what() {
-    return 'Give the page a scale: the printed board in the photograph, or four points whose places you know.';
+    return this.#hanging
+      ? 'Give the page a scale: the length of the DLO, or the distance of the clamps.'
+      : 'Give the page a scale: the printed board in the photograph, or four points whose places you know.';
   }
 
   missing() {
