@@ -59,6 +59,7 @@ from dlo_calibration.workspace.live_information import appraise, Appraised  # no
 from dlo_calibration.workspace.next_action import LEAST_TRIALS, next_action, NextAction  # noqa: E402
 
 MIDDLE = (25.0, 75.0)  # of the scale
+ROPES = (48.1, 82.7)  # of that of flexibility: what is stiffer is no rope, and hardly bends on a table
 WANTED = 'flexibility 1.4, friction 3'
 ALL_WANTED = 'flexibility 1.4, friction 3, elasticity 5, self_collision 5'
 MOST = 12  # trials
@@ -87,7 +88,8 @@ class Session:
 def rope_of(seed: int, draw: int) -> PlayedRope:
     """Return an object with random properties; `draw` changes what the camera sees."""
     generator = np.random.default_rng(seed)
-    values = {name: float(generator.uniform(*MIDDLE)) for name in Options().space.free}
+    values = {name: float(generator.uniform(*(ROPES if name == 'flexibility' else MIDDLE)))
+              for name in Options().space.free}
     return PlayedRope(values, np.random.default_rng([seed, draw]), length=float(generator.uniform(0.5, 0.9)),
                       turn=float(generator.uniform(-1.5, 1.5)))
 

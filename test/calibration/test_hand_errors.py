@@ -45,8 +45,8 @@ def collected(sent, **more):
 
 
 @cache
-def fit(names=PHYSICS, late=0.0, shift=(0.0, 0.0, 0.0), **more):
-    trials, _ = collected(messages(late, shift))
+def fit(names=PHYSICS, late=0.0, shift=(0.0, 0.0, 0.0), draw=1, **more):
+    trials, _ = collected(messages(late, shift, draw))
     return calibrate(trials, Options(mass=MASS, engine='compiled', workers=1, parts=1, calibrate=names,
                                      values=GIVEN, **more))
 
@@ -71,12 +71,12 @@ def test_late_and_shifted_hands_come_back_within_their_intervals():
 
 @pytest.mark.long
 def test_hands_that_are_right_cost_the_other_intervals_little():
-    right, wider = fit(), fit((*PHYSICS, *HANDS[:3]))
-    for name in HANDS[:3]:
-        estimate = wider.parameters[name]  # of one draw of noise: 90 % would be too much to ask of three
-        assert abs(estimate.value - 50) < 2.6 * estimate.std, name
+    right, *wider = fit(), *(fit((*PHYSICS, *HANDS[:3]), draw=draw) for draw in (1, 2, 3, 4))
+    hands = [result.parameters[name] for result in wider for name in HANDS[:3]]
+    assert sum(hand.lower <= 50 <= hand.upper for hand in hands) >= 9  # of 12, 90 % each
+    assert max(abs(hand.value - 50) / hand.std for hand in hands) < 3.5
     for name in PHYSICS:
-        assert width(wider, name) <= 1.1 * width(right, name), name
+        assert width(wider[0], name) <= 1.1 * width(right, name), name
 
 
 @pytest.mark.long
