@@ -24,9 +24,9 @@ from dlo_calibration.planning.surroundings import passed_wrongly, Surroundings
 
 REFERENCE = 0  # focal point of the score: the first point, because no hand holds the DLO after a plan
 
-DIFFERENCE = 0.012  # m, step of a finite difference; friction makes smaller ones misleading
+DIFFERENCE = 0.02  # of the length, step of a finite difference; friction makes smaller ones misleading
 SHARES = (0.3, 1.0, 1.5)  # of the Gauss-Newton step that are tried together
-LONGEST = 0.15  # m, of a step of one displacement
+LONGEST = 0.25  # of the length, of a step of one displacement
 DAMPING = 0.02  # of the mean curvature
 WORTH = 0.97  # share of the squares; a step that does not reduce them to less ends the refinement
 
@@ -62,6 +62,7 @@ class Objective:
     def __init__(self, start: Chain, goal: Chain, kind: str, surroundings: Surroundings = NOTHING) -> None:
         self.goal = goal.points
         self.posts = surroundings.posts(start.points, goal.points)  # (p, 2) [m]
+        self.length = start.length  # m
         self.detour = OTHER_SIDE * start.length  # m, for each of them
         self._scored = kind == SCORE
         marked = np.flatnonzero(start.features | goal.features)
@@ -359,7 +360,8 @@ class BeamSearch:
                  ) -> Asking[list[MoveSequence]]:
         """Refine the displacements of drafts side by side; `sequences` are the simulated drafts."""
         best = list(sequences)
-        refinements = [refine(draft.shifts, self._objective.residuals(sequence.end), iterations)
+        length = self._objective.length
+        refinements = [refine(draft.shifts, self._objective.residuals(sequence.end), iterations, length)
                        for draft, sequence in zip(drafts, sequences, strict=True)]
         asked = {k: next(refinement) for k, refinement in enumerate(refinements)}
         while asked:
@@ -448,7 +450,7 @@ class BeamSearch:
         return overloads[0] if len(overloads) > SELDOM * len(drawn) else ''
 
 
-def refine(shifts: Floats, residuals: Floats, iterations: int
+def refine(shifts: Floats, residuals: Floats, iterations: int, length: float
            ) -> Generator[Floats, Sequence[Floats | None], None]:
     """
     Lower the sum of squared residuals by damped Gauss-Newton steps.
@@ -458,17 +460,20 @@ def refine(shifts: Floats, residuals: Floats, iterations: int
 
     :param shifts: (d,) initial displacements [m]; `residuals` (m,) [m] there.
     :param iterations: largest number of steps.
+    :param length: of the DLO [m]; steps are shares of it.
     """
+    difference = DIFFERENCE * length
     jacobian: Floats | None = None
     for _ in range(iterations):
         tried: list[tuple[Floats, Floats | None]] = []
         if jacobian is None:
             sides = Differences.one_sided(
-                shifts, np.arange(len(shifts)), np.where(shifts < 0, -DIFFERENCE, DIFFERENCE))
+                shifts, np.arange(len(shifts)), np.where(shifts < 0, -difference, difference))
             answers = yield sides.points
             tried += zip(sides.points, answers, strict=True)
             jacobian = sides.jacobian(np.zeros((len(residuals), len(shifts))), answers, residuals)
-        points = shifts + np.outer(SHARES, _damped_step(Linearisation(shifts, residuals, jacobian)))
+        points = shifts + np.outer(SHARES, _damped_step(
+            Linearisation(shifts, residuals, jacobian), LONGEST * length))
         answers = yield points
         tried += zip(points, answers, strict=True)
         costs = [np.inf if answer is None else float(np.sum(answer**2)) for _, answer in tried]
@@ -480,9 +485,9 @@ def refine(shifts: Floats, residuals: Floats, iterations: int
         shifts, residuals = moved, after
 
 
-def _damped_step(model: Linearisation) -> Floats:
-    """Return the damped Gauss-Newton step, (d,) [m], within LONGEST."""
+def _damped_step(model: Linearisation, longest: float) -> Floats:
+    """Return the damped Gauss-Newton step, (d,) [m]; no displacement in it is longer than `longest` [m]."""
     curvature = model.information
     damping = DAMPING * np.trace(curvature) / len(curvature) + 1e-9
     step = model.step(damping * np.eye(len(curvature)))
-    return np.asarray(step * min(1.0, LONGEST / max(float(np.abs(step).max()), 1e-12)))
+    return np.asarray(step * min(1.0, longest / max(float(np.abs(step).max()), 1e-12)))

@@ -99,7 +99,7 @@ def test_the_score_counts_if_asked():
 def refined(residuals, start, iterations=5):
     """Return the best point (d,) [m], and how many points were tried."""
     tried = [np.array(start)]
-    asking = refine(tried[0], residuals(tried[0]), iterations)
+    asking = refine(tried[0], residuals(tried[0]), iterations, 0.6)
     points = next(asking)
     while True:
         tried.extend(points)
