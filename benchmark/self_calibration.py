@@ -40,7 +40,7 @@ from dlo_calibration.calibration.choice import choose  # noqa: E402
 from dlo_calibration.calibration.engines import make_simulator  # noqa: E402
 from dlo_calibration.inference.target import read_targets, wanted_deviations  # noqa: E402
 from dlo_calibration.model.action import Action  # noqa: E402
-from dlo_calibration.model.parameters import SCALE  # noqa: E402
+from dlo_calibration.model.parameters import BY_NAME, SCALE  # noqa: E402
 from dlo_calibration.observation.table import lowest_level  # noqa: E402
 from dlo_calibration.planning.inquiry import Inquiries, Inquiry  # noqa: E402
 from dlo_calibration.planning.options import AdviceOptions  # noqa: E402
@@ -196,7 +196,8 @@ def draw_session(session: Session, trials: Sequence[Trial], names: Sequence[str]
             axes.errorbar(count, (low + high) / 2, (high - low) / 2, fmt='none', color=SIMULATED, capsize=4,
                           label='90 % interval')
             axes.axhline(session.truth[name], color=OBSERVED, linestyle='--', linewidth=1, label='truth')
-            axes.annotate(f'± {(high - low)[-1] / 2:.1f}; wanted: ± {SCALE * limits[name]:g}',
+            wanted = SCALE * limits[name] / BY_NAME[name].extent
+            axes.annotate(f'± {(high - low)[-1] / 2:.1f}; wanted: ± {wanted:.3g}',
                           (count[-1], high[-1]), (0, 12), textcoords='offset points', ha='right')
             axes.set(xlabel='trials', ylabel=f'{name}, 0 to 100', xticks=count, ylim=(0, 100))
         add_legend(below, below.axes)
