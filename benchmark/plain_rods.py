@@ -26,7 +26,7 @@ RODS, TRIALS, POINTS = 20, 4, 21
 LENGTH, MASS, NOISE = 0.6, 0.03, 2e-4  # m; kg; m of a point in each coordinate, as of markers
 SECONDS, GOALS = 2.0, 20  # of a trial
 #: What is drawn, on the scale of 0 to 100.
-DRAWN = {'flexibility': (35, 65), 'damping': (30, 60), 'internal_damping': (20, 60), 'torsion': (40, 70)}
+DRAWN = {'flexibility': (55, 75.8), 'damping': (30, 60), 'internal_damping': (20, 60), 'torsion': (40, 70)}
 
 
 def hands(points: np.ndarray, times: np.ndarray, left: np.ndarray, right: np.ndarray) -> tuple[Hand, ...]:
