@@ -15,7 +15,7 @@ from dlo_calibration.calibration.fit import Fit, fit
 from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.evaluation.residuals import compared_goals, Huber, ResidualLayout
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.model.parameters import BY_NAME, ParameterSpace, SCALE
+from dlo_calibration.model.parameters import BY_NAME, ParameterSpace
 from dlo_calibration.model.score import without_offsets
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.search import Hints, LeastSquares
@@ -61,12 +61,12 @@ def of_forces(trials: Sequence[Trial], residuals: Floats) -> tuple[float, Floats
 
 def heavier(space: ParameterSpace, point: Floats, factor: float) -> Floats:
     """Return the (d,) point of a DLO with larger mass and stiffnesses, by a factor; it moves alike."""
-    other = point.copy()
-    for k, name in enumerate(space.free):
+    values = space.values(point)
+    for name, value in values.items():
         parameter = BY_NAME[name]
         if parameter.name == 'mass' or parameter.per_weight:
-            other[k] = parameter.value(factor * parameter.physical(SCALE * point[k])) / SCALE
-    return np.clip(other, 0.0, 1.0)
+            values[name] = parameter.value(factor * parameter.physical(value))
+    return np.clip(space.point(values), 0.0, space.upper)
 
 
 def weighed(setting: Setting, best: Fit) -> tuple[Setting, Fit]:
@@ -90,7 +90,8 @@ def weighed(setting: Setting, best: Fit) -> tuple[Setting, Fit]:
         setting = setting.weighing_forces((x, y, z))
         dimension, spent = space.dimension, len(best.evaluations)
         search = LeastSquares(dimension, setting.options.seed, Hints(
-            heavier(space, best.best.point, factor), np.ones(dimension, bool), refines=True))
+            heavier(space, best.best.point, factor), np.ones(dimension, bool), refines=True,
+            upper=space.upper))
         again = fit(setting, space, search, budget(dimension), first=spent)
         best = replace(again, parts=best.parts, validated=best.validated,
                        evaluations=best.evaluations + again.evaluations)

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from dlo_calibration import calibrate, Options
+from dlo_calibration.calibration.forces import heavier
+from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.observation.plausibility import implausible_trials
 from dlo_calibration.report.sentences import sentences
 
@@ -53,6 +55,15 @@ def test_forces_tell_mass_and_stiffnesses_that_nobody_told(pulled):
     words, = (text for text in sentences(result) if 'measured forces' in text)
     assert words.startswith('6 measured forces on hands are 0.0')
     assert 'they tell the mass, and so stiffnesses absolutely' in words
+
+
+def test_a_heavier_dlo_has_its_stiffnesses_in_proportion():
+    space = ParameterSpace(('flexibility', 'elasticity', 'friction', 'mass'))
+    values = {'flexibility': 80.0, 'elasticity': 40.0, 'friction': 60.0, 'mass': 50.0}
+    before, after = (space.physical(space.values(point), 0.6) for point in (
+        space.point(values), heavier(space, space.point(values), 2.0)))
+    ratios = {name: after[name] / before[name] for name in space.free}
+    assert ratios == pytest.approx({'flexibility': 2.0, 'elasticity': 2.0, 'friction': 1.0, 'mass': 2.0})
 
 
 @pytest.mark.long
