@@ -5,7 +5,7 @@
 How many trials a robot needs that asks its own questions, compared with two that do not.
 
     python benchmark/self_calibration.py [--objects N] [--seeds N] [--all-wanted] [--sessions FILE]
-    python benchmark/self_calibration.py --first 9 --picture doc/self_calibration.png
+    python benchmark/self_calibration.py --first 17 --picture doc/self_calibration.png
 
 Each object is a rope with random properties from the middle of the scale, played with physics of its own
 (examples/played_rope.py: twice the nodes, half the time step, noise of 1.5 mm, grips off by up to 5 mm, 5 %
