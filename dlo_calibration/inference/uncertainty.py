@@ -159,7 +159,11 @@ class Uncertainty:
 
     @property
     def undetermined(self) -> tuple[Floats, ...]:
-        """Unit vectors (d,) of combinations of two or more parameters that are not identifiable."""
+        """
+        Unit vectors (d,) of combinations of two or more parameters that are not identifiable.
+
+        Where all combinations of the same parameters are not, none says more than that each of them is not.
+        """
         if self.covariance is None:
             return ()
         values, vectors = np.linalg.eigh(self.covariance)
@@ -167,7 +171,9 @@ class Uncertainty:
                     for value, vector in zip(values[::-1], vectors.T[::-1], strict=True)
                     if 2 * DEVIATIONS * np.sqrt(value) > IDENTIFIABLE_WIDTH
                     and (np.abs(vector) >= INVOLVED).sum() > 1]
-        return tuple(combined)
+        involved = [tuple(np.flatnonzero(np.abs(vector) >= INVOLVED)) for vector in combined]
+        return tuple(vector for vector, those in zip(combined, involved, strict=True)
+                     if involved.count(those) < len(those))
 
 
 def good_count(evaluations: int) -> int:

@@ -3,7 +3,7 @@
 
 """The uncertainty of calibrated parameters."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -273,6 +273,13 @@ def test_two_parameters_that_only_show_together_are_named_as_a_combination():
     combination, = uncertainty.undetermined
     assert np.abs(combination) == pytest.approx([2**-0.5, 2**-0.5, 0], abs=0.05)
     assert combination[0] * combination[1] < 0
+
+
+def test_two_parameters_of_which_nothing_is_known_are_no_combination():
+    covariance = np.array([[0.08, 0.04, 0.0], [0.04, 0.08, 0.0], [0.0, 0.0, 1e-6]])
+    fit = Linearisation(POINT, np.random.default_rng(4).normal(0, 1e-3, ROWS), linear_model())
+    uncertainty = at_minimum(fit, LAYOUT, noise=1e-3)
+    assert replace(uncertainty, covariance=covariance).undetermined == ()
 
 
 def test_a_value_at_the_end_of_the_scale_is_flagged_and_its_interval_ends_there():
