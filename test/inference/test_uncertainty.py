@@ -373,6 +373,20 @@ def test_an_interval_contains_what_the_trials_say_without_any_one_of_them():
     assert (uncertainty.upper >= np.clip(without, 0, 1)).all()
 
 
+def test_trials_that_the_noise_of_their_initial_chains_explains_do_not_disagree():
+    generator, jacobian = np.random.default_rng(13), linear_model()
+    jacobian[LAYOUT.rows[0].stop:, 0] *= 0.01  # only the first trial tells the first parameter
+    residuals = generator.normal(0, 1e-3, ROWS) + generator.normal(0, 1e-3, ROWS)
+    others = slice(LAYOUT.rows[0].stop, None)
+    residuals[others] += 1e-3 * jacobian[others, 0] / np.abs(jacobian[others, 0]).max()
+    fit = Linearisation(POINT, residuals, jacobian)
+    starts = [residuals + generator.normal(0, 1e-3, ROWS) for _ in range(11)]
+    agree, explained, disagree = (
+        at_minimum(fit, LAYOUT, noise=noise, starts=starts) for noise in (2e-3, 1.2e-3, 1e-4))
+    assert (explained.upper - explained.lower).tolist() == (agree.upper - agree.lower).tolist()
+    assert disagree.upper[0] - disagree.lower[0] > 5 * (agree.upper[0] - agree.lower[0])
+
+
 def test_an_error_of_the_hands_widens_the_intervals_as_far_as_it_moves_the_optimum():
     residuals, jacobian = np.random.default_rng(12).normal(0, 1e-3, ROWS), linear_model()
     fit = Linearisation(POINT, residuals, jacobian)
