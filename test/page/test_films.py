@@ -44,6 +44,22 @@ def whole(tmp_path_factory):
     return path, film
 
 
+def sees_the_arrow(tab, server):
+    """Let a person see the next movement on the film: from the DLO, as the last trial has left it."""
+    tab.button('Show it on the newest picture').click()
+    head = tab.find('#drawn .head path')
+    head.wait_for()
+    assert tab.find('#drawn .advised').count() == 1
+    advice = server.state()['advice']
+    (begin, *_, end), = advice['ways']
+    box, (u, v) = head.bounding_box(), tab.place(end)
+    assert box['x'] - 6 <= u <= box['x'] + box['width'] + 6
+    assert box['y'] - 6 <= v <= box['y'] + box['height'] + 6
+    line = server.done('GET', f'api/films/{advice["view"]}/line')
+    seen = np.array(line['pixels'][-1], float)
+    assert np.nanmin(np.linalg.norm(seen - begin, axis=1)) < 20
+
+
 def marked(page, identity, time, places):
     """Put clicks into an image of a film, and follow the DLO."""
     def edit(document):
@@ -115,7 +131,7 @@ def test_a_film_becomes_a_trial_that_survives_the_end_of_the_page(tmp_path, whol
 def test_a_person_drops_a_film_clicks_calibrates_and_sees_the_simulated_dlo_on_it(tmp_path, whole):
     path, film = whole
     with browser() as started, served(tmp_path / 'project', '--evaluations', 40, '--calibrate', 'flexibility',
-                                      'friction', simulator=CompiledSimulator) as server:
+                                      'friction', simulator=CompiledSimulator, appraising=True) as server:
         tab = Tab(started, server.address)
         tab.find('input[type=file][accept*="video"]').set_input_files(str(path))
         tab.button('Follow the DLO').wait_for()
@@ -130,9 +146,14 @@ def test_a_person_drops_a_film_clicks_calibrates_and_sees_the_simulated_dlo_on_i
         tab.find('text=Use this trial').wait_for()
         tab.field('Mass of the DLO').fill('30')
         tab.page.keyboard.press('Tab')
+        tab.find('.advice').get_by_text('Grip').wait_for()
+        assert tab.find('#drawn .head').count() == 0  # the DLO lies elsewhere in the first image
+        sees_the_arrow(tab, server)
         tab.button('Next: Calibrate').click()
         tab.page.get_by_role('button', name='Calibrate', exact=True).last.click()
         tab.find('section[aria-label=Result]').wait_for()
+        sees_the_arrow(tab, server)
+        tab.button('Next: Calibrate').click()
         tab.button('Watch').click()
         tab.field('Time of the film').fill(str(round(film.holds[0][1], 1)))
         tab.find('#drawn .simulated').wait_for()

@@ -31,8 +31,8 @@ export class FilmStep {
     return this.app.project.state.films[this.id];
   }
 
-  /** Show a film. */
-  open(id) {
+  /** Show a film, or where its last trial has ended. */
+  open(id, ended = false) {
     if (id !== this.id) {
       this.id = id;
       this.time = 0;
@@ -45,7 +45,23 @@ export class FilmStep {
       this.#video.onpause = () => this.app.refresh();
       this.#video.onplay = () => this.#follow();
     }
+    if (ended) this.#seek(this.#end);
     this.app.refresh();
+  }
+
+  /** @returns {number} when the last trial has ended [s] */
+  get #end() {
+    return this.seen.trials?.at(-1)?.end ?? 0;
+  }
+
+  /** @returns {boolean} whether the DLO is shown as the last trial has left it */
+  get #ended() {
+    return this.time > this.#end - this.#half;
+  }
+
+  /** @returns {number} how far an image may be from a time to be the one of that time [s] */
+  get #half() {
+    return 0.6 / (this.seen.frame_rate ?? 30);
   }
 
   close() {
@@ -112,8 +128,7 @@ export class FilmStep {
 
   /** @returns {number} index of the clicks in the image that is shown; -1: there are none */
   get #mark() {
-    const half = 0.6 / (this.seen.frame_rate ?? 30);
-    return this.entry.marks.findIndex(({time}) => Math.abs(time - this.time) < half);
+    return this.entry.marks.findIndex(({time}) => Math.abs(time - this.time) < this.#half);
   }
 
   panel() {
@@ -148,7 +163,7 @@ export class FilmStep {
         }),
       ),
       progress || seen.waiting ? this.#progress(progress) : null,
-      advised(app, this.id),
+      advised(app, this.#ended ? this.id : null),
       seen.trials ? this.#outcome(seen, entry) : null,
       h(
         'details',
@@ -292,7 +307,7 @@ export class FilmStep {
     return [
       ...pieces(pixels).map((piece, k) => line(piece, seen.outdated ? 'before' : 'sure', `piece${k}`)),
       simulated ? line(simulated, 'simulated', 'simulated') : null,
-      ...(this.time >= (seen.trials?.at(-1)?.end ?? 0) ? arrows(this.app, this.id) : []),
+      ...(this.#ended ? arrows(this.app, this.id) : []),
       ...(here < 0 ? [] : entry.marks[here].clicks).map((at, k) =>
         mark({
           name: `click ${k}`,

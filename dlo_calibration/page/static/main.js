@@ -88,9 +88,9 @@ class App {
   }
 
   /** Show a film, in place of the steps. */
-  openFilm(id) {
+  openFilm(id, ended = false) {
     this.project.clear();
-    this.film.open(id);
+    this.film.open(id, ended);
     this.#fit = true;
     this.view.unsettle();
     this.refresh();
