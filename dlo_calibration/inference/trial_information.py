@@ -38,6 +38,7 @@ from dlo_calibration.inference.uncertainty import (
     DEVIATIONS,
     HARDLY,
     IDENTIFIABLE,
+    MODEL_ERROR,
     NOT_IDENTIFIABLE,
     optimum_shift,
     prior_information,
@@ -65,7 +66,6 @@ ROUNDS = 12  # Gauss-Newton steps to the best values, at most
 WORTH_A_STEP = 0.1  # that a step must promise to save
 WORTH_A_MOVE = 0.5  # that one of the values TRIED must save
 TRIED = 0.15, 0.25  # the first value, and from one to the next, where a derivative may not point to the best
-MISFIT = 2.0  # times the noise level: larger residuals let the best values be sought all over the scales
 SCATTERED = 24  # points there
 STARTS = 8  # simulations of each trial from initial chains with other noise
 #: A trial is informative if it reduces a standard deviation below this share; repeating one leaves 0.71.
@@ -312,11 +312,11 @@ class Appraiser:
         """
         trials = [without_repeated_goals(trial) for trial in trials]
         models = [*before.models, *[None] * (len(trials) - len(before.models))]
-        best = self._minimum(trials, models, before.point, before.uncertainty.std)
+        best = self._minimum(trials, models, before.point, before.promised)
         for better_start in (self._better_start, self._scattered_start):
             elsewhere = better_start(trials, best)
             if elsewhere is not None:
-                other = self._minimum(trials, [None] * len(trials), elsewhere, before.uncertainty.std)
+                other = self._minimum(trials, [None] * len(trials), elsewhere, before.promised)
                 best = min(best, other, key=lambda minimum: best.loss.cost(minimum.residuals))
         return self._examined(before.names, trials, best.point, tuple(
             model if model.complete else self._completed(model, trial)
@@ -353,10 +353,10 @@ class Appraiser:
             uncertainty = at_minimum(fit, layout, noise=self.noise)
             best = _Minimum(fit.residuals, point, now, uncertainty)
             weighted = fit.weighted(loss.roots(fit.residuals) / uncertainty.scale)
-            step = weighted.step(prior_information(len(point)))
+            prior = prior_information(len(point))
+            step, std = weighted.step(prior), standard_deviations(weighted.information + prior)
             there = np.clip(point + np.clip(step, -WIDEST, WIDEST), 0.0, self.space.upper)
             saved = loss.cost(fit.residuals) - loss.cost(fit.predicted(there - point))
-            std = uncertainty.std
             if saved > WORTH_A_STEP * uncertainty.scale**2:
                 point = there
             elif all(model.holds(point, steps_within(std)) for model in now):
@@ -386,7 +386,7 @@ class Appraiser:
 
     def _scattered_start(self, trials: Sequence[Trial], best: _Minimum) -> Floats | None:
         """Return the best of (d,) points all over the scales if a minimum misses the trials by far."""
-        if not best.uncertainty.residual > MISFIT * self.noise:
+        if not best.uncertainty.residual > MODEL_ERROR * self.noise:
             return None
         points = drawn_points(best.point, Appraisal.before(self.space.free, best.point).uncertainty,
                               SCATTERED, 0)

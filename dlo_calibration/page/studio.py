@@ -374,10 +374,8 @@ class Studio:
 
     def _with_films(self, drafts: Drafts) -> Drafts:
         """Return drafts with the trials of the films behind those of the photographs."""
-        filmed = [TrialDraft(TrialWarnings(), trial=own.trial)
-                  for entry in self.project.document.films
-                  if (followed := self._film_room.followed.get(entry.id)) is not None
-                  for k, own in enumerate(followed.trials) if k not in entry.left_out]
+        filmed = [TrialDraft(TrialWarnings(), trial=own.trial, name=own.changes(entry).name)
+                  for entry in self.project.document.films for own in self._film_room.used(entry)]
         first = len(drafts.trials)
         named = [replace(draft, trial=draft.trial and replace(draft.trial, name=_name(first + k)))
                  for k, draft in enumerate(filmed)]
@@ -389,11 +387,9 @@ class Studio:
         if not drafts.trials or drafts.trials[-1].trial is None:
             return None
         for entry in reversed(self.project.document.films):
-            followed = self._film_room.followed.get(entry.id)
-            used = [own for k, own in enumerate(followed.trials if followed else ())
-                    if k not in entry.left_out]
-            if used and followed is not None:
-                scale = followed.scale_at(used[-1].zero + used[-1].trial.goals[-1].time)
+            used = self._film_room.used(entry)
+            if used:
+                scale = self._film_room.scale_at(entry.id, used[-1].zero + used[-1].trial.goals[-1].time)
                 return None if scale is None else (entry.id, scale)
         goal = self.project.document.trials[-1].goal or ''
         scale = drafts.photographs[goal].scale if goal in drafts.photographs else None

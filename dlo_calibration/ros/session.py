@@ -124,13 +124,13 @@ class Place:
 
     :param chain: the first one that shows it there.
     :param told: whether that is an initial chain, so that the DLO rests.
-    :param since: time when it was seen there first [s], and `until` when last.
+    :param since: stamp of that one, and `until` of the last one that shows it there [ns].
     """
 
     chain: Chain
     told: bool
-    since: float
-    until: float
+    since: int
+    until: int
 
 
 def is_near(chain: Chain, other: Chain) -> bool:
@@ -606,7 +606,7 @@ class CalibrationSession(NodeSession[CalibratorOptions]):
 
     def _take_place(self, message: Message) -> None:
         """Keep where the newest chain shows the DLO, until an action moves it."""
-        state, now = self._state, self._clock()
+        state = self._state
         if message.stamp < state.newest:  # as of an action that a tracker tells when it is over
             return
         state.newest = message.stamp
@@ -616,9 +616,9 @@ class CalibrationSession(NodeSession[CalibratorOptions]):
         pose = self._collector.pose
         chain = message.chain if pose is None else pose.chain(message.chain)
         if message.kind != INITIAL and state.seen is not None and is_near(state.seen.chain, chain):
-            state.seen.until = now
+            state.seen.until = message.stamp
         else:
-            state.seen = Place(chain, message.kind == INITIAL, now, now)
+            state.seen = Place(chain, message.kind == INITIAL, message.stamp, message.stamp)
 
     def _place(self, quiet: bool) -> Chain | None:
         """
@@ -635,8 +635,8 @@ class CalibrationSession(NodeSession[CalibratorOptions]):
                 return None
             if goal.stable and (quiet or goal.count > 1) and is_near(seen.chain, goal.chain):
                 return goal.chain
-        lies = seen.until - seen.since > self._graph.options().pause + LAID
-        return seen.chain if lies else None
+        lain = (seen.until - seen.since) / NANOSECONDS
+        return seen.chain if lain > self._graph.options().pause + LAID else None
 
     def _renew_information(self) -> None:
         """
