@@ -38,12 +38,13 @@ from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import BY_NAME, KNOTS, LOCKING, MOST_PARTS, ParameterSpace
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.material import clamp_twist, clamps
-from dlo_calibration.observation.noise import noise
+from dlo_calibration.observation.noise import NO_NOISE, noise, with_other_noise
 from dlo_calibration.search import Hints, LeastSquares
 from dlo_calibration.search.descent import Descent
 
 STEP = 0.015  # of the finite differences by new parameters, in units of a search
 MOST_COARSE = 6  # evaluations per parameter for a coarse search
+STARTS = 4  # of each trial, with other noise
 LEAST_SHARE = 0.04  # of the cost: new parameters that explain less cannot lower the error by 2 %
 BEGINNINGS = (0.03, 0.1, 0.3)  # m; bend radii from the best of which a search of locking begins
 
@@ -56,25 +57,29 @@ def refine(setting: Setting, uniform: Fit, budget: int) -> Fit:
     Add knots to the rest shape, also with locking, then halve all parts, while cross-validation improves.
 
     Cross-validation predicts each trial from the others (Stone, Cross-validatory choice, 1974), so that
-    what only fits noise is rejected. Nothing is tried if noise alone explains the residuals, or if the
-    linear model shows that new parameters would explain too little. Each search is least squares and starts
-    at the optimum of the coarser space. All evaluations count in the budget, and `Fit.evaluations` contains
+    what only fits noise is rejected. Nothing is tried if noise alone explains the residuals, in goals and
+    at the start, or if the linear model shows that new parameters would explain too little. Each search is
+    least squares and starts at the optimum of the coarser space. All evaluations count in the budget, and `Fit.evaluations` contains
     those of rejected spaces, too. The search in the chosen space stops early: among many parameters that
     the trials hardly determine, the last percent of the cost is noise that the fit would learn (Prechelt,
     Automatic Early Stopping Using Cross Validation, 1998).
 
     :param uniform: the fit of the uniform DLO.
     :param budget: largest number of evaluations of all searches, including those of `uniform`.
-    :returns: `uniform` itself if nothing was tried.
+    :returns: `uniform` if nothing was tried.
     """
     space, trials = uniform.space, setting.trials
-    if uniform.stopped or _explained(trials, uniform):
+    if uniform.stopped or _explained(uniform, noise(trials)):
         return uniform
     try:  # the best point may have no model
         model = uniform.model or _linearised(setting, space, uniform.best.point, np.arange(space.dimension))
+        level = math.hypot(noise(trials), _effect_of_starts(setting, uniform))
     except CancelledError:
         return uniform
-    ladder, words = _Ladder(setting, replace(uniform, model=model), budget), []
+    uniform = replace(uniform, validated=STARTS)
+    if _explained(uniform, level):
+        return uniform
+    ladder, words = _Ladder(setting, replace(uniform, model=model), budget, level), []
     if _shows_rest_shape(trials, space):
         twist = clamp_twist(trials)
         rungs = [(knots, partial(_with_knots, knots, twist)) for knots in KNOTS if knots > space.knots]
@@ -95,15 +100,16 @@ class _Ladder:
     Tries ever finer spaces, and keeps the best predictor of left-out trials.
 
     :ivar best: the best fit so far; every fit that is tried has its linear model.
+    :param level: of noise [m], with what it does at the start; if it explains the residuals, no rung is tried.
     """
 
-    def __init__(self, setting: Setting, best: Fit, budget: int) -> None:
+    def __init__(self, setting: Setting, best: Fit, budget: int, level: float) -> None:
         self.best = best
         self._best_errors: Floats | None = None  # (f,) [m] see `_left_out`; None: not known yet
-        self._setting, self._budget = setting, budget
+        self._setting, self._budget, self._level = setting, budget, level
         self._layout = ResidualLayout.compared(setting.trials)
         self._tried = [best]
-        self._simulated = 0  # parameter sets, beside those of the searches
+        self._simulated = best.validated  # parameter sets, beside those of the searches
 
     @property
     def _spent(self) -> int:
@@ -121,7 +127,7 @@ class _Ladder:
         """
         why, latest, missed = '', self.best, 0
         for count, finer in rungs:
-            if _explained(self._setting.trials, self.best):
+            if _explained(self.best, self._level):
                 break
             space, _ = finer(latest.space, latest.best.point)
             if self._budget - self._spent < 2 * space.dimension:
@@ -157,7 +163,7 @@ class _Ladder:
 
         :returns: the outcome in words; empty if it was not tried.
         """
-        if _explained(self._setting.trials, self.best):
+        if _explained(self.best, self._level):
             return ''
         uniform = self._tried[0]
         if self._budget - self._spent < 2 * (uniform.space.dimension + 1):
@@ -301,8 +307,29 @@ def _cost(fit: Fit, other: Fit) -> float:
     return Huber.of(other.model.residuals).cost(fit.model.residuals)
 
 
-def _explained(trials: Sequence[Trial], fit: Fit) -> bool:
-    """Tell whether noise alone explains the residuals of a fit."""
+def _effect_of_starts(setting: Setting, fit: Fit) -> float:
+    """
+    Return what the noise of the initial chains does to the residuals of a fit: a standard deviation [m].
+
+    A DLO that swings multiplies the noise of its start, by which no parameter is told.
+
+    :raises CancelledError: when stopped.
+    """
+    trials, level = setting.trials, noise(setting.trials)
+    if not level > NO_NOISE or 'length_scale' in fit.space.free:
+        return 0.0
+    drawn = with_other_noise(trials, level, STARTS, np.random.default_rng(0))
+    seen = [residuals for others in drawn
+            for residuals in setting.evaluate(fit.space, others).residuals(fit.best.point[None])]
+    if any(residuals is None for residuals in seen):
+        return 0.0
+    chains = np.stack([residuals for residuals in seen if residuals is not None])
+    away = (chains - chains.mean(axis=0)).ravel() * math.sqrt(STARTS / (STARTS - 1))
+    return Huber.of(away).deviation(away, 0)
+
+
+def _explained(fit: Fit, level: float) -> bool:
+    """Tell whether noise of this level [m] alone explains the residuals of a fit."""
     residuals = fit.best.residuals
     return residuals is not None and noise_alone(
-        Huber.of(residuals).deviation(residuals, fit.space.dimension), noise(trials))
+        Huber.of(residuals).deviation(residuals, fit.space.dimension), level)

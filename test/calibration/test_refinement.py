@@ -3,9 +3,10 @@
 
 """Refinement: as many knots of the rest shape and parts as the trials support."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
-from carried_trials import EVEN, observed, STIFF_MIDDLE, TRUTH
+from carried_trials import EVEN, observed, POINTS, STIFF_MIDDLE, TRUTH
 import numpy as np
 import pytest
 
@@ -14,6 +15,7 @@ from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.refinement import _Ladder
 from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.evaluation.evaluation import Evaluator
+from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.simulation.compiled import CompiledSimulator
 
@@ -98,6 +100,17 @@ def test_a_straight_dlo_stays_straight():
 
 
 @pytest.mark.long
+def test_what_the_noise_of_the_starts_does_to_a_stiff_dlo_does_not_bend_it():
+    straight, noise = {'flexibility': 40.0, 'torsion': 60.0}, np.random.default_rng(1)
+    trials = [replace(trial, initial=Chain(trial.initial.points + noise.normal(0, 5e-4, (POINTS, 3))))
+              for trial in observed(ParameterSpace(tuple(straight)), straight)]
+    result = calibrated(trials, names=tuple(straight))
+    assert result.examination.uncertainty.residual > 3 * 5e-4
+    assert result.space.free == tuple(straight)
+    assert ';' not in result.stop_reason  # no knots and parts were tried
+
+
+@pytest.mark.long
 def test_a_cable_that_locks_is_found():
     locks = {**STRANDS, 'locking': 62.0}
     result = calibrated(observed(ParameterSpace(tuple(locks)), locks), budget=800, names=tuple(STRANDS))
@@ -129,11 +142,11 @@ def test_a_rod_whose_errors_have_another_cause_does_not_lock():
 @pytest.mark.parametrize('first, kept', [((-0.8, -0.6, -0.3, 0.5), 3), ((0.1, 0.1, 0.1, 0.1), 0)])
 def test_rungs_that_predict_better_but_not_significantly_do_not_end_a_climb(monkeypatch, first, kept):
     logarithms = [np.zeros(4), np.array(first), np.array(first), np.full(4, -1.0)]
-    rungs = [SimpleNamespace(space=EVEN, best=SimpleNamespace(point=None), evaluations=(),
+    rungs = [SimpleNamespace(space=EVEN, best=SimpleNamespace(point=None), evaluations=(), validated=0,
                              errors=np.exp(logarithm)) for logarithm in logarithms]
-    ladder = _Ladder(Setting(tuple(observed(EVEN, TRUTH)), Options(), None), rungs[0], 100)
+    ladder = _Ladder(Setting(tuple(observed(EVEN, TRUTH)), Options(), None), rungs[0], 100, 1e-3)
     coming = iter(rungs[1:])
-    monkeypatch.setattr('dlo_calibration.calibration.refinement._explained', lambda trials, rung: False)
+    monkeypatch.setattr('dlo_calibration.calibration.refinement._explained', lambda rung, level: False)
     monkeypatch.setattr(ladder, '_fitted', lambda *arguments: next(coming))
     monkeypatch.setattr(ladder, '_fold_errors', lambda rung: rung.errors)
     ladder.climb([(count, lambda space, point: (space, point)) for count in (3, 5, 9)])

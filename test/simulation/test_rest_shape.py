@@ -131,3 +131,28 @@ def test_a_hand_that_turns_about_the_axis_turns_the_dlo(engine):
     assert simulator.simulate(around(3.0), without).chains == pytest.approx(
         simulator.simulate(around(0.0), without).chains, abs=1e-9)
     simulator.close()
+
+
+def twisted(points, turns):
+    """Return a trial: the first clamp of a DLO turns about its axis by `turns` [rad], evenly in time."""
+    quaternions = [[np.sin(angle / 2), 0, 0, np.cos(angle / 2)] for angle in turns]
+    hands = (Hand('left', (0, 1), np.linspace(0, 1, len(turns)), [points[0]] * len(turns), quaternions),
+             Hand('right', (19, 20), [0.0, 1.0], [points[20]] * 2))
+    return Trial('twisted', Chain(points), (Action(hands),),
+                 tuple(Goal(Chain(points), time, stable=False, held_by=('left', 'right'))
+                       for time in (4.0, 5.0)))
+
+
+@pytest.mark.parametrize('turn', [3.0, 3.3, -3.3])
+def test_a_dlo_twisted_by_about_half_a_turn_stays_as_it_is_in_the_next_trial(turn):
+    # The directions of both clamps are the same after a turn in either direction.
+    points = np.stack([np.linspace(0, 0.5, 21), np.zeros(21), np.full(21, 0.5)], axis=1)
+    points[1:-1, 2] -= 0.8 * (points[1:-1, 0] - 0.025) * (0.475 - points[1:-1, 0])
+    curved = {f'rest_curvature_{axis}{knot}': 6.0 * (axis == 'x') for axis in 'xy' for knot in (1, 2, 3)}
+    physical = {**ParameterSpace().physical({}, 0.5), 'flexibility': 2e-3, 'damping': 3.0, 'torsion': 0.8,
+                'clamp_twist': np.pi, **curved}  # the hands' directions differ by half a turn
+    simulator = CompiledSimulator(table=False, nodes=21)
+    rests, later = simulator.simulate(twisted(points, (0, turn / 2, turn)), physical).chains
+    assert later == pytest.approx(rests, abs=1e-3)
+    again = simulator.simulate(twisted(rests, (turn, turn)), physical).chains
+    assert again[-1] == pytest.approx(later, abs=1e-3)

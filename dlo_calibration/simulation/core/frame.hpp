@@ -241,23 +241,39 @@ inline void balance_torques(Rods<Number>& rods, const Ropes& ropes, bool begun) 
   }
 }
 
+/// The energy [N m] of twist and natural curvature, less that of the straight DLO.
+inline double frame_energy(const Rods<double>& rods) {
+  double energy = 0.0;
+  for (std::size_t i = 0; i < rods.joints.size(); ++i) {
+    const Joint<double>& joint = rods.joints[i];
+    const auto [x, y] = turned(rods.natural[i].x, rods.natural[i].y, joint);
+    const double twist = rods.angles[i + 1] - rods.angles[i];
+    energy += rods.twisting[i] * twist * twist / 2 - x * joint.x - y * joint.y;
+  }
+  return energy;
+}
+
 /// Compute the angles at the start: evenly twisted between clamps of known direction, else without twist.
-inline void begin_frame(Rods<double>& rods, const Ropes& ropes) {
+/// `more` [rad] is added to the twist between two clamps.  Return that of the last two.
+inline double begin_angles(Rods<double>& rods, const Ropes& ropes, double more) {
   auto& angles = rods.angles;
   const int segments = static_cast<int>(angles.size());
   const auto [along, across] = mean_direction(rods);
   angles.assign(segments, angle_of(across, along));
   int last = -1;
+  double twist = 0.0;
   for (const Clamp& clamp : ropes[0]->clamps) {
     if (!std::isfinite(clamp.direction.x)) continue;
     const int j = clamp.segment;
     const Point &t = rods.tangents[j], &u = rods.across[j], &d = clamp.direction;
     const double angle = angle_of(dot(t, cross(u, d)), dot(u, d)), near = angles[last < 0 ? j : last];
-    const double there = angle + kTwoPi * __builtin_nearbyint((near - angle) / kTwoPi);
+    double there = angle + kTwoPi * __builtin_nearbyint((near - angle) / kTwoPi);
     if (last < 0) angles.assign(segments, there);
-    else
+    else {
+      if (j > last + 1) there += more, twist = there - near;
       for (int i = last; i < segments; ++i)
         angles[i] = angles[last] + (there - angles[last]) * min(1.0, double(i - last) / (j - last));
+    }
     last = j;
   }
   for (int i = 0; i < segments - 1; ++i) {
@@ -266,6 +282,22 @@ inline void begin_frame(Rods<double>& rods, const Ropes& ropes) {
     rods.joints[i].cosine = by.cosine, rods.joints[i].sine = by.sine;
   }
   for (int k = 0; k < kFirstTurns; ++k) balance_torques(rods, ropes, false);
+  return twist;
+}
+
+/// Compute the angles at the start.  The clamps' directions leave whole turns of the twist open: it is at most
+/// half a turn, or one turn less if the energy is then less, as it is where a rest shape is twisted by nearly
+/// half a turn.
+inline void begin_frame(Rods<double>& rods, const Ropes& ropes) {
+  const double twist = begin_angles(rods, ropes, 0.0);
+  if (twist == 0.0) return;
+  const auto angles = rods.angles;
+  const auto joints = rods.joints;
+  const auto clamps = ropes[0]->clamps;
+  const double energy = frame_energy(rods);
+  begin_angles(rods, ropes, twist > 0.0 ? -kTwoPi : kTwoPi);
+  if (frame_energy(rods) < energy) return;
+  rods.angles = angles, rods.joints = joints, ropes[0]->clamps = clamps;
 }
 inline void begin_frame(Rods<Lanes>&, const Ropes&) {}  // never called: a rope's first step is taken alone
 
