@@ -20,7 +20,7 @@ from dlo_calibration.calibration.result import CalibrationResult, simulated_chai
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.evaluation.evaluation import Evaluator
 from dlo_calibration.files.result import Description
-from dlo_calibration.inference.outlier import LARGER, SOMETHING_ELSE, SURELY
+from dlo_calibration.inference.outlier import SOMETHING_ELSE, SURELY
 from dlo_calibration.model.parameters import BY_NAME, measured, number, ParameterSpace
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.grips import GripEvidence
@@ -93,14 +93,14 @@ def with_large_errors(result: CalibrationResult, file: Description, options: Opt
     """
     Return a validation with a warning that names the trials whose errors are larger than usual.
 
-    The usual error is the median over the trials. A trial is sensitive if it explains the error together with
-    how far the uncertainty of the parameters moves the points, on average; then nothing may be wrong.
+    The usual error is the median over the trials. A trial is sensitive if the usual error explains its own,
+    together with how far the uncertainty of the parameters moves its points, on average.
 
     :param result: what `validated` returns for `file` and `options`.
     """
     errors = np.array([each.mean() for each in result.trial_errors])
     usual = float(np.median(errors))
-    large = np.flatnonzero(errors > LARGER * usual).tolist()
+    large = np.flatnonzero(errors > SURELY * usual).tolist()
     if len(errors) < 3 or not large:
         return result
     sensitive: list[str] = []
@@ -113,7 +113,7 @@ def with_large_errors(result: CalibrationResult, file: Description, options: Opt
         ('these are sensitive', sensitive), (f'in these, {SOMETHING_ELSE}', odd)) if names]
     return replace(result, warnings=(*result.warnings, (
         f'half of the trials miss by at most {measured(usual, "m")}; those that miss by more than '
-        f'{number(LARGER)} times that, with what the uncertainty of the parameters alone moves their points; '
+        f'{number(SURELY)} times that, with what the uncertainty of the parameters alone moves their points; '
         f'{"; ".join(words)}')))
 
 
