@@ -29,7 +29,7 @@ import inspect, json, sys, time
 import numpy as np
 from dlo_calibration import read_session
 from dlo_calibration.errors import SimulationError
-from dlo_calibration.model.parameters import PAPER_PARAMETERS, ParameterSpace
+from dlo_calibration.model.parameters import BY_NAME, PAPER_PARAMETERS, ParameterSpace
 from dlo_calibration.simulation.compiled import CompiledSimulator
 
 stoppable = 'stop' in inspect.signature(CompiledSimulator.simulate_together).parameters
@@ -57,6 +57,8 @@ for physics, fixed in (('', {}), (', all cable physics', {
     rng, jobs = np.random.default_rng(1), []
     for _ in range(6):
         values = {name: 100 * rng.random() for name in PAPER_PARAMETERS}
+        # The scale of the other checkout may be another one.
+        values['flexibility'] = BY_NAME['flexibility'].value(10 ** (-1 - 0.045 * values['flexibility']))
         jobs += [(trial, ParameterSpace(fixed=fixed, mass=0.03).physical(values, 1.0)) for trial in trials]
     simulator = CompiledSimulator()
     portions = [jobs[k:k + 48] for k in range(0, len(jobs), 48)]

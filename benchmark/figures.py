@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 import platform
@@ -42,6 +43,15 @@ def side_by_side(benchmark: Any, calls: Mapping[str, Callable[[], object]], roun
 def table(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     """Return a table in Markdown."""
     return '\n'.join(f'| {" | ".join(map(str, row))} |' for row in (columns, ['---'] * len(columns), *rows))
+
+
+def kept(path: Path, make: Callable[[], Any]) -> Any:
+    """Return the plain values of a file that an interrupted run has written; else make and write them."""
+    if not path.exists():
+        part = path.with_suffix('.part')
+        part.write_text(json.dumps(make()), encoding='utf-8')
+        part.rename(path)
+    return json.loads(path.read_text(encoding='utf-8'))
 
 
 def machine() -> str:

@@ -7,21 +7,24 @@ Track DLOs in rendered films whose truth is known, and compare.
 A film shows a simulated rope and a hand that moves it, at 1920 x 1080 pixels and 30 images a second, with
 shadows, blur, noise and compression; in two of ten, the camera is held in the hand.
 
-    python benchmark/film.py [FILMS] [SECONDS]
+    python benchmark/film.py [--films N] [--folder FOLDER] [--only FILM]
 
-FILMS is the number of films, 10 unless told otherwise; SECONDS is their longest duration.  The films are kept
-in a temporary folder while they are tracked.
+All films take some two hours.  FOLDER keeps them and the figures of each, so that a run goes on where another
+was interrupted; remove from it what shall be made anew.  With --only, one film is made and tracked, and
+nothing is written.
 """
 
+import argparse
 from dataclasses import dataclass, replace
 import math
 from pathlib import Path
-import resource
+import subprocess
 import sys
 import tempfile
 import time
 from typing import Any, Iterator, Sequence
 
+from figures import kept, machine, table
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
@@ -38,8 +41,8 @@ from dlo_calibration.calibration.options import Options  # noqa: E402
 from dlo_calibration.model.chain import Chain, Floats  # noqa: E402
 from dlo_calibration.model.named_actions import Drag, GraspAndPlace, NamedAction  # noqa: E402
 from dlo_calibration.model.trial import Goal, Trial  # noqa: E402
-from dlo_calibration.vision.film import read_film  # noqa: E402
-from dlo_calibration.vision.tracker import Tracker  # noqa: E402
+from dlo_calibration.vision.film import Film, read_film  # noqa: E402
+from dlo_calibration.vision.observer import FilmWriter, Observer  # noqa: E402
 from dlo_calibration.vision.view import BoardFinder, film_lens  # noqa: E402
 
 FILMS = 10
@@ -53,6 +56,7 @@ EXPOSURE, SUBFRAMES = 0.008, 3  # s; instants that are averaged
 COUNT = 21  # points that are compared
 WRONG = 0.008  # m: farther from the DLO than its diameter is wrong
 LIFTED = 0.002  # m above the table, from where on a point is not on it
+DURATIONS = (15.0, 90.0)  # s, of films whose memory is measured
 LOOKS = (
     Look(ground='wood', ground_colour=(0.72, 0.55, 0.38), ground_contrast=0.1, colour=(0.10, 0.24, 0.55)),
     Look(colour=(0.75, 0.15, 0.1), lamp=(0.5, 0.7)),
@@ -142,12 +146,17 @@ def _moved(points: Floats, named: NamedAction,
     return list(chains), list(places), [bool(hand.times[0] <= time <= hand.end) for time in times]
 
 
+def held(number: int) -> bool:
+    """Return whether the camera of a film is held in the hand."""
+    return number % 5 == 4
+
+
 def camera(number: int, time: float) -> Camera:
-    """Return the camera of a film at a time [s]; every fifth one is held in the hand."""
+    """Return the camera of a film at a time [s]."""
     generator = np.random.default_rng(100 + number)
     tilt, turn, roll = generator.uniform((0.2, -0.3, -0.05), (0.6, 0.3, 0.05))
     place = Camera(SIZE, FOCAL, tilt, turn, roll, 0.78, (0.31, 0.0))
-    if number % 5 != 4:
+    if not held(number):
         return place
     sway = [0.02 * math.sin(time * rate + 2 * k) for k, rate in enumerate((2.3, 3.1, 1.7, 2.0))]
     return replace(place, tilt=tilt + sway[0], turn=turn + sway[1], roll=roll + sway[2],
@@ -161,7 +170,7 @@ def images(number: int, listed: Sequence[Moment]) -> Iterator[Any]:
     for k, moment in enumerate(listed):
         before = listed[max(k - 1, 0)]
         instants = []
-        still = moment.hand is None and before.hand is None and number % 5 != 4
+        still = moment.hand is None and before.hand is None and not held(number)
         for share in (np.linspace(0.0, 1.0, SUBFRAMES) - 0.5) * EXPOSURE * RATE if not still else (0.0,):
             # The middle of the exposure is the image's time.
             other = listed[min(max(k + int(np.sign(share)), 0), len(listed) - 1)]
@@ -175,72 +184,153 @@ def images(number: int, listed: Sequence[Moment]) -> Iterator[Any]:
 
 def _instant(number: int, time: float, chain: Floats, hand: Floats | None) -> Instant:
     along = np.linspace(0.0, 1.0, len(chain))
-    curve = CubicSpline(along, chain)(np.linspace(0.0, 1.0, 401))
+    curve = CubicSpline(along, chain)(np.linspace(0.0, 1.0, 241))
     hands = () if hand is None else (Hand((float(hand[0]), float(hand[1])), -1.5, float(hand[2]) + 0.004),)
     return Instant(camera(number, time), curve, hands, ())
 
 
-def report(number: int, folder: Path, longest: float) -> dict[str, Any]:
-    """Render a film, track it, and return what came out."""
-    listed = [moment for moment in moments(number) if moment.time < longest]
+def rendered(number: int, folder: Path) -> tuple[Path, list[Moment]]:
+    """Return a film, which is made unless the folder has it, and what happens in it."""
+    listed = moments(number)
     path = folder / f'film{number}.mp4'
     if not path.exists():
-        write_film(path, images(number, listed), RATE)
+        part = folder / f'part{number}.mp4'
+        write_film(part, images(number, listed), RATE)
+        part.rename(path)
+    return path, listed
+
+
+def clicks(number: int, listed: Sequence[Moment]) -> Floats:
+    """Return the rough clicks (5, 2) of a person in the first image [px]."""
+    exact = camera(number, 0.0).project(listed[0].chain[::30])
+    return np.asarray(exact + np.random.default_rng(number).normal(0.0, 3.0, exact.shape))
+
+
+def report(number: int, folder: Path) -> dict[str, Any]:
+    """Track the DLO in a film, and return what came out."""
+    path, listed = rendered(number, folder)
     truth = [BOARD.seen_from(moment.chain) for moment in listed]
-    first = camera(number, 0.0).project(listed[0].chain[::30])
-    clicks = first + np.random.default_rng(number).normal(0.0, 3.0, first.shape)
-    begin = time.perf_counter(), time.process_time()
     film = read_film(path)
-    lens = film_lens(film)
-    finder, tracker = BoardFinder(lens), Tracker(COUNT)
-    errors, worst, lost, wrong = [], [], [], []
+    observer = Observer(BoardFinder(film_lens(film)), COUNT)
+    means, points_off, lost, wrong = [], [], [], []
     spent = 0.0
-    for k, frame in enumerate(film):
-        watch = time.process_time()
-        scale = finder.next(frame.pixels)
-        tracked = tracker.next(frame.pixels, 1 / film.frame_rate, scale) if k else tracker.start(
-            frame.pixels, clicks, scale)
-        spent += time.process_time() - watch
-        if scale is None:
-            lost.append((frame.time, 'too little of the board is seen'))
+    frames = iter(film)
+    for k, chain in enumerate(truth):
+        watch = time.perf_counter()
+        frame = next(frames)
+        view = observer.next(frame.time, frame.pixels) if k else observer.start(
+            frame.time, frame.pixels, clicks(number, listed))
+        spent += time.perf_counter() - watch
+        if view.scale is None or view.tracked.lost:
+            lost.append(frame.time)
             continue
-        if tracked.lost:
-            lost.append((frame.time, tracked.reason))
-            continue
-        chain = truth[k]
-        points = scale.points(tracked.pixels, RADIUS)
+        points = view.points(RADIUS)
         fine = Chain(chain)
         true = fine.resample(np.linspace(0.0, fine.length, COUNT))
         dense = fine.resample(np.linspace(0.0, fine.length, 601))
-        seen = np.isfinite(points).all(axis=1)
-        table = seen & (true[:, 2] < RADIUS + LIFTED)
-        if table.any():
-            off = 1e3 * np.linalg.norm(points[table, :2] - true[table, :2], axis=1)
-            errors.append(float(off.mean()))
-            worst.append((float(off.max()), frame.time))
+        table_points = np.isfinite(points).all(axis=1) & (true[:, 2] < RADIUS + LIFTED)
+        if table_points.any():
+            off = 1e3 * np.linalg.norm(points[table_points, :2] - true[table_points, :2], axis=1)
+            means.append(float(off.mean()))
+            points_off.append(float(off.max()))
             # Wrong: where no part of the DLO is.  A part in the air is seen elsewhere on the table.
-            gap = cKDTree(dense[:, :2]).query(points[table, :2])[0]
+            gap = cKDTree(dense[:, :2]).query(points[table_points, :2])[0]
             if (gap > WRONG).sum() > 1:
                 wrong.append(frame.time)
-    seconds = time.perf_counter() - begin[0]
-    count = len(listed)
-    return {'film': number, 'images': count, 'mean_mm': float(np.mean(errors)) if errors else math.nan,
-            'worst_frame_mm': max(errors, default=math.nan), 'worst_point_mm': max(worst, default=math.nan),
-            'tracked': 1 - len(lost) / count, 'wrong': len(wrong) / count, 'wrong_at': wrong[:5],
-            'lost': lost[:3], 'images_per_s': count / seconds, 'cpu_ms': 1e3 * spent / count,
-            'memory_mb': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3}
+    return {'images': len(truth), 'mean_mm': float(np.mean(means)), 'worst_image_mm': max(means),
+            'worst_point_mm': max(points_off), 'lost': lost, 'wrong': wrong,
+            'images_per_s': len(truth) / spent}
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def to_and_fro(film: Film, path: Path, seconds: float) -> None:
+    """Write a film that plays another one forwards and backwards, until it has so many seconds."""
+    writer = FilmWriter(str(path), film.size, film.frame_rate)
+    left = round(seconds * film.frame_rate)
+    while left > 0:
+        for frames in (film.frames(), film.backwards()):
+            for frame in frames:
+                if left > 0:
+                    writer.write(frame.pixels)
+                    left -= 1
+    writer.close()
+
+
+def memory(folder: Path, seconds: float) -> dict[str, Any]:
+    """Return the most memory that `track` and its decoder take together, for a film of so many seconds."""
+    path, listed = rendered(0, folder)
+    long = folder / f'long{seconds:.0f}.mp4'
+    to_and_fro(read_film(path), long, seconds)
+    points = ' '.join(f'{u:.0f},{v:.0f}' for u, v in clicks(0, listed))
+    command = [sys.executable, '-m', 'dlo_calibration', 'track', str(long), '--points', points, '--board',
+               '--output', str(folder / 'tracked'), '--json']
+    most = 0.0
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        while process.poll() is None:
+            most = max(most, resident_mb(process.pid))
+            time.sleep(0.1)
+    assert process.returncode == 0, process.returncode
+    long.unlink()
+    return {'seconds': seconds, 'memory_mb': most}
+
+
+def resident_mb(process: int) -> float:
+    """Return the memory of a process and of its children [MB], what they share once."""
+    try:
+        children = Path(f'/proc/{process}/task/{process}/children').read_text().split()
+        rows = Path(f'/proc/{process}/smaps_rollup').read_text().splitlines()
+    except (FileNotFoundError, ProcessLookupError):  # it has ended
+        return 0.0
+    own = sum(float(row.split()[1]) for row in rows if row.startswith('Pss:')) * 1024 / 1e6
+    return own + sum(resident_mb(int(child)) for child in children)
+
+
+def text_of(reports: Sequence[dict[str, Any]], memories: Sequence[dict[str, Any]]) -> str:
+    """Return the tables."""
+    rows = [(number, 'in the hand' if held(number) else 'on a stand', own['images'],
+             f'{own["mean_mm"]:.2f}', f'{own["worst_image_mm"]:.1f}', f'{own["worst_point_mm"]:.1f}',
+             f'{100 * (1 - len(own["lost"]) / own["images"]):.1f} %', len(own['wrong']),
+             f'{own["images_per_s"]:.1f}') for number, own in enumerate(reports)]
+    total = sum(own['images'] for own in reports)
+    rows.append(('all', '', total, f'{np.mean([own["mean_mm"] for own in reports]):.2f}',
+                 *(f'{max(own[key] for own in reports):.1f}' for key in ('worst_image_mm', 'worst_point_mm')),
+                 f'{100 * (1 - sum(len(own["lost"]) for own in reports) / total):.1f} %',
+                 sum(len(own['wrong']) for own in reports),
+                 f'{np.mean([own["images_per_s"] for own in reports]):.1f}'))
+    columns = ('film', 'camera', 'images', 'points on the table off by, mm', 'worst image, mm',
+               'worst point, mm', 'tracked', 'wrong images, not said', 'images a second')
+    return (table(columns, rows) + '\n\n'
+            + table(('film, s', 'memory of `track` and its decoder at most, MB'),
+                    [(f'{own["seconds"]:.0f}', f'{own["memory_mb"]:.0f}') for own in memories]))
+
+
+def main() -> None:
     """Conduct the benchmark."""
-    given = sys.argv[1:] if arguments is None else arguments
-    films = int(given[0]) if given else FILMS
-    longest = float(given[1]) if len(given) > 1 else math.inf
-    with tempfile.TemporaryDirectory() as folder:
-        for number in range(films):
-            print(report(number, Path(folder), longest), flush=True)
-    return 0
+    parser = argparse.ArgumentParser(description=__doc__.partition('\n\n')[0].strip())
+    parser.add_argument('--films', type=int, default=FILMS)
+    parser.add_argument('--folder', type=Path, help='of films and figures (default: a temporary one)')
+    parser.add_argument('--only', type=int, metavar='FILM')
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = options.folder or Path(temporary)
+        folder.mkdir(parents=True, exist_ok=True)
+        numbers = range(options.films) if options.only is None else (options.only,)
+        reports = []
+        for number in numbers:
+            reports.append(kept(folder / f'film{number}.json', lambda number=number: report(number, folder)))
+            print(number, reports[-1], flush=True)
+        if options.only is not None:
+            return
+        memories = [kept(folder / f'memory{seconds:.0f}.json', lambda s=seconds: memory(folder, s))
+                    for seconds in DURATIONS]
+    text = text_of(reports, memories)
+    print(text)
+    how = ('Rendered films of 1920 x 1080 pixels; all points that are seen, whose true height is that of a '
+           f'DLO on the table. A wrong image shows two points or more over {1e3 * WRONG:.0f} mm from any '
+           'part of the DLO. Images a second: to decode, to find the board, the tags and the DLO. For the '
+           'memory, the first film plays to and fro.')
+    (HERE / 'results' / 'film.md').write_text(
+        f'# film\n\n`python benchmark/film.py`\n\n{how} {machine()}\n\n{text}\n', encoding='utf-8')
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    main()

@@ -6,18 +6,22 @@ From rendered films to parameters: the path of a hand from its tag, and whether 
 
 Each object is a rope with parameters of its own; in each of its films, a hand with a tag moves it twice.
 
-    python benchmark/film_trials.py [OBJECTS] [FILMS] [WIDTH]
+    python benchmark/film_trials.py [--objects N] [--films N] [--width PX] [--folder FOLDER]
 
-OBJECTS (5) have FILMS (2) each, of WIDTH (1920) pixels.  A JSON document is printed for each film, and one
-for the fit of all films of an object.
+FOLDER keeps films, sessions and figures, so that a run goes on where another was interrupted; remove from it
+what shall be made anew.
 """
 
+import argparse
+import functools
 import json
+import math
 from pathlib import Path
 import subprocess
 import sys
 import tempfile
 
+from figures import kept, machine, table
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -31,6 +35,7 @@ from dlo_calibration import read_session  # noqa: E402
 
 RATE = 15.0  # images in a second
 BLUE = (0.10, 0.24, 0.55)
+NAMES, KEYS = ('flexibility', 'friction', 'elasticity', 'self_collision'), ('value', 'lower', 'upper')
 DELAYS = np.arange(-0.1, 0.101, 0.005)  # s
 
 
@@ -80,41 +85,92 @@ def path_errors(film, report, folder):
     return rows
 
 
-def main(arguments=None):
-    """Conduct the benchmark."""
-    given = [int(word) for word in (sys.argv[1:] if arguments is None else arguments)]
-    objects, films, width = [*given, *(5, 2, 1920)[len(given):]]
+def tracked(number, take, width, folder):
+    """Return what `track` finds in a film of an object; its session lies in a folder of its own."""
     camera = film_camera((width, width * 9 // 16))
-    held = asked = 0
-    for number in range(objects):
-        true, sessions = truth(number), []
-        with tempfile.TemporaryDirectory() as folder:
-            for take in range(films):
-                film = filmed_trials(moves(np.random.default_rng((number, take))), RATE, true, seed=take)
-                path, out = Path(folder) / f'{take}.mp4', Path(folder) / f'{take}'
-                write_film(path, film.images(camera, exposed=1, seed=take, colour=BLUE), RATE)
-                points = ' '.join(f'{u:.0f},{v:.0f}' for u, v in clicks(film, camera, seed=take))
-                report = command('track', path, '--points', points, '--board', '--output', out)
-                print(json.dumps({
-                    'object': number, 'film': take, 'trials': len(report['trials']),
-                    'tracked': report['tracked'] / report['frames'], 'fps': report['fps'],
-                    'hands': path_errors(film, report, out) if report['trials'] else [],
-                    'problems': report['problems']}), flush=True)
-                sessions += [out / 'session.mcap'] * bool(report['trials'])
-            if not sessions:
-                continue
-            result = command('fit', *sessions, '--mass', MASS, '--output', Path(folder) / 'fitted')
-        found = result['parameters']
-        rows = {name: (true[name], *(round(found[name][key], 1) for key in ('value', 'lower', 'upper')))
-                for name in ('flexibility', 'friction', 'elasticity', 'self_collision')
-                if found[name]['identifiable']}
-        inside = sum(lower <= right <= upper for right, _, lower, upper in rows.values())
-        held, asked = held + inside, asked + len(rows)
-        print(json.dumps({'object': number, 'identifiable': rows,
-                          'mean_error_mm': 1e3 * result['mean_error_m'],
-                          'intervals_that_hold': f'{held} of {asked}'}), flush=True)
-    return 0
+    film = filmed_trials(moves(np.random.default_rng((number, take))), RATE, truth(number), seed=take)
+    path, out = folder / f'{number}_{take}.mp4', folder / f'{number}_{take}'
+    if not path.exists():
+        part = path.with_stem(f'part_{number}_{take}')
+        write_film(part, film.images(camera, exposed=1, seed=take, colour=BLUE), RATE)
+        part.rename(path)
+    points = ' '.join(f'{u:.0f},{v:.0f}' for u, v in clicks(film, camera, seed=take))
+    found = command('track', path, '--points', points, '--board', '--output', out)
+    return {'trials': len(found['trials']), 'tracked': found['tracked'] / found['frames'],
+            'hands': path_errors(film, found, out) if found['trials'] else [], 'problems': found['problems']}
+
+
+def fitted(number, takes, folder):
+    """Return what `fit` finds in all films of an object: name -> truth, value, lower, upper, verdict."""
+    sessions = [folder / f'{number}_{take}' / 'session.mcap' for take in takes]
+    result = command('fit', *sessions, '--mass', MASS, '--output', folder / f'fitted_{number}')
+    true, found = truth(number), result['parameters']
+    return {'mean_error_mm': 1e3 * result['mean_error_m'], 'parameters': {
+        name: {'true': true[name], **{key: found[name][key] for key in KEYS}} for name in NAMES
+        if found[name]['identifiable']}}
+
+
+def text_of(films, fits):
+    """Return the tables of films, (object, film) -> `tracked`, and of fits, object -> `fitted`."""
+    rows = []
+    for (number, take), own in films.items():
+        hands = own['hands']
+        worst = [max((abs(hand[key]) for hand in hands if hand[key] is not None), default=math.nan)
+                 for key in ('path_mm', 'path_without_mean_mm', 'turn_deg', 'delay_ms', 'place_error')]
+        rows.append((number, take, f'{own["trials"]} of 2', f'{100 * own["tracked"]:.1f} %',
+                     f'{worst[0]:.1f}', f'{worst[1]:.1f}', f'{worst[2]:.1f}', f'{worst[3]:.0f}',
+                     f'{100 * worst[4]:.1f}'))
+    columns = ('object', 'film', 'trials', 'tracked', 'path of the hand, mm', 'without its mean, mm',
+               'turn, degrees', 'delay, ms', 'place that it holds, % of the length')
+    first = table(columns, rows)
+    rows, held = [], []
+    for number, own in fits.items():
+        cells = {}
+        for name, found in own['parameters'].items():
+            holds = found['lower'] <= found['true'] <= found['upper']
+            text = f'{found["value"]:.1f} [{found["lower"]:.1f}, {found["upper"]:.1f}] ({found["true"]:.1f})'
+            cells[name] = text if holds else f'**{text}**'
+            held.append(holds)
+        rows.append((number, *(cells.get(name, '') for name in NAMES), f'{own["mean_error_mm"]:.2f}'))
+    columns = ('object', *(f'{name}: found [interval] (truth)' for name in NAMES), 'fitted, mm')
+    return (f'{first}\n\n{table(columns, rows)}\n\n{sum(held)} of {len(held)} intervals of identifiable '
+            'parameters contain the truth; those that do not are bold.')
+
+
+def main():
+    """Conduct the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__.partition('\n\n')[0].strip())
+    parser.add_argument('--objects', type=int, default=5)
+    parser.add_argument('--first', type=int, default=0, help='number of the first object')
+    parser.add_argument('--films', type=int, default=2, help='of each')
+    parser.add_argument('--width', type=int, default=1280, help='of the images [px]')
+    parser.add_argument('--folder', type=Path, help='of films and figures (default: a temporary one)')
+    options = parser.parse_args()
+    films, fits = {}, {}
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = options.folder or Path(temporary)
+        folder.mkdir(parents=True, exist_ok=True)
+        for number in range(options.first, options.first + options.objects):
+            for take in range(options.films):
+                films[number, take] = kept(folder / f'{number}_{take}.json', functools.partial(
+                    tracked, number, take, options.width, folder))
+                print(number, take, films[number, take], flush=True)
+            takes = [take for take in range(options.films) if films[number, take]['trials']]
+            if takes:
+                fits[number] = kept(folder / f'fitted_{number}.json', functools.partial(
+                    fitted, number, takes, folder))
+                print(number, fits[number], flush=True)
+    text = text_of(films, fits)
+    print(text)
+    words = ['python benchmark/film_trials.py', *(
+        f'--{name} {getattr(options, name)}' for name in ('objects', 'first', 'films', 'width')
+        if getattr(options, name) != parser.get_default(name))]
+    how = (f'Rendered films {options.width} pixels wide, {RATE:.0f} images a second. In the first table,'
+           ' each figure is the worse one of the trials. The intervals and verdicts are those that the '
+           'calibration finds.')
+    (HERE / 'results' / 'film_trials.md').write_text(
+        f'# film_trials\n\n`{" ".join(words)}`\n\n{how} {machine()}\n\n{text}\n', encoding='utf-8')
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    main()

@@ -31,11 +31,12 @@ def observed(name: str, ways: dict[int, tuple[float, float, float]], dice: np.ra
     goal = Goal(Chain(LYING), 3.0, held_by=names, forces=wanted)
     trial = Trial(name, Chain(LYING), (Action(hands),), (goal,))
     reality = CompiledSimulator(nodes=81, time_step=1e-3).simulate(trial, ROPE)
+    initial, shown = (Chain(points + dice.normal(0, 1e-3, LYING.shape))
+                      for points in (LYING, reality.chains[0]))
     goal = replace(
-        goal, chain=Chain(reality.chains[0] + dice.normal(0, 1e-3, LYING.shape)),
-        forces=tuple(replace(force, vector=vector + dice.normal(0, 0.02, 3))
+        goal, chain=shown, forces=tuple(replace(force, vector=vector + dice.normal(0, 0.02, 3))
                      for force, vector in zip(wanted, reality.forces, strict=True)))
-    return replace(trial, goals=(goal,))
+    return replace(trial, initial=initial, goals=(goal,))
 
 
 def main() -> None:

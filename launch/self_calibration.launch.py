@@ -18,4 +18,5 @@ def generate_launch_description():
     return tracker_and_calibrator(__file__, {
         'wanted': "half widths of 90 % intervals, e.g. 'flexibility 2, friction 3'",
         'hands': 'number of hands', 'reach_1': 'where hand_1 can be', 'reach_2': 'where hand_2 can be',
-        'height': 'lift of an action [m]', 'speed': 'of the hands [m/s]'})
+        'height': 'lift of an action [m]', 'speed': 'of the hands [m/s]',
+        'resume': 'folder of a session that was interrupted, even by a crash'})

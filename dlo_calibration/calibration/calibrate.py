@@ -77,8 +77,7 @@ def calibrate(trials: Sequence[Trial], options: Options | None = None, *,
 
     with ExitStack() as stack:
         simulator = stack.enter_context(closing(make_simulator(options)))
-        second = stack.enter_context(second_engine(
-            options, make_simulator, simulator.name, len(trials)))
+        second = stack.enter_context(second_engine(options, make_simulator, simulator.name))
         executor = stack.enter_context(closing(
             ClusterExecutor(options.scheduler, warn, on_notice) if options.scheduler else
             Threads(options.workers)))

@@ -213,8 +213,8 @@ class Options(DeclaredOptions):
     hand_shift_z: float = _hand_shift('z')
     slow_chain_error: float = declared(
         0.0, 'standard deviation of errors that neighbouring points of a chain share, as those of a film; '
-        'they widen the intervals as far as they move the values; 0: none', unit='m', minimum=0.0,
-        maximum=0.1, of=OBSERVATION)
+        'they widen the intervals as far as they move the values; 0: none; of several sessions, the largest '
+        'counts', unit='m', minimum=0.0, maximum=0.1, of=OBSERVATION)
     slow_hand_error: float = declared(
         0.0, 'standard deviation of the place along the DLO that a hand grips; its way is off by a third of '
         'it; likewise', unit='m', minimum=0.0, maximum=0.1, of=OBSERVATION)

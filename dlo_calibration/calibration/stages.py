@@ -24,7 +24,7 @@ from dlo_calibration.errors import one_line, SimulationError
 from dlo_calibration.evaluation.evaluation import Evaluation, Evaluator
 from dlo_calibration.evaluation.linearisation import Linearisation
 from dlo_calibration.evaluation.log import Memory
-from dlo_calibration.evaluation.pool import cores, Pool, Threads
+from dlo_calibration.evaluation.pool import Pool, Threads
 from dlo_calibration.evaluation.process_simulator import ProcessSimulator
 from dlo_calibration.evaluation.residuals import compared_rows, Huber, ResidualLayout
 from dlo_calibration.inference.advice import advise
@@ -48,7 +48,6 @@ from dlo_calibration.search import Hints, LeastSquares
 from dlo_calibration.simulation.protocol import Rollout, Simulator
 
 CHAINS = 32  # initial chains with other noise, over all trials
-MOST_PROCESSES = 2  # that confirm; each takes 50 MB
 STOPPED_PATIENCE = 5.0  # s that a confirmation may take after a request to stop
 
 #: Adds the confirmation by a second engine to a result.
@@ -207,13 +206,12 @@ def with_missing_parameters(setting: Setting, result: CalibrationResult) -> Cali
 
 
 @contextmanager
-def second_engine(options: Options, make_simulator: SimulatorFactory, first: str, trials: int
+def second_engine(options: Options, make_simulator: SimulatorFactory, first: str
                   ) -> Iterator[Simulator | Exception | None]:
     """
-    Make the engine that confirms the result; its processes start during the search.
+    Make the engine that confirms the result; its process starts during the search.
 
     :param first: name of the engine that searches; it does not confirm itself.
-    :param trials: their number.
     :return: None if no confirmation is wanted; an exception if the engine cannot be made.
     """
     simulator: Simulator | Exception | None = None
@@ -224,7 +222,7 @@ def second_engine(options: Options, make_simulator: SimulatorFactory, first: str
             except Exception as error:
                 simulator = error
         if isinstance(simulator, ProcessSimulator):
-            simulator.start(min(trials, options.workers or cores(), MOST_PROCESSES))
+            simulator.start()
         yield simulator
 
 
@@ -253,8 +251,7 @@ def confirming(result: CalibrationResult, second: Simulator | Exception | None,
         yield lambda unconfirmed: unconfirmed
     else:
         evaluator = Evaluator(result.trials, result.space, second)
-        threads = Threads(second.processes if isinstance(second, ProcessSimulator) else 1)
-        with closing(threads):
+        with closing(Threads(1)) as threads:  # one process: each takes 50 MB
             pool = Pool(second, threads, late, memory)
             try:
                 yield partial(_confirmed, evaluator, pool.begin(evaluator.jobs(result.best.point)),
@@ -266,7 +263,7 @@ def confirming(result: CalibrationResult, second: Simulator | Exception | None,
 def confirmed(result: CalibrationResult, options: Options, make_simulator: SimulatorFactory
               ) -> CalibrationResult:
     """Return a result with the confirmation by a second engine; see `confirming`."""
-    with second_engine(options, make_simulator, result.engine, len(result.trials)) as second, \
+    with second_engine(options, make_simulator, result.engine) as second, \
             confirming(result, second, obstacles=bool(options.scene)) as confirm:
         return confirm(result)
 

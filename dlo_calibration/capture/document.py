@@ -198,6 +198,28 @@ class HeldEntry:
     height: float = entry_field(lambda entry: entry.number(0.0, 2.0), 0.0)
 
 
+def _instant(entry: JsonValue) -> float | None:
+    return entry.number(0.0, LONGEST_FILM) if entry.given else None
+
+
+@dataclass(frozen=True)
+class FilmedTrialEntry:
+    """
+    What the person changed about a trial of a film.
+
+    :param at: an instant at which a hand moves the DLO in it [s].
+    :param start: from when on the rest before counts [s]; None: as it is found.
+    :param end: until when the rest afterwards counts [s]; None: as it is found.
+    :param name: as the person calls it; empty: its number.
+    """
+
+    at: float = entry_field(lambda entry: entry.number(0.0, LONGEST_FILM))
+    start: float | None = entry_field(_instant, None)
+    end: float | None = entry_field(_instant, None)
+    name: str = entry_field(lambda entry: entry.text(NAME_LENGTH), '')
+    used: bool = entry_field(JsonValue.truth, True)
+
+
 @dataclass(frozen=True)
 class FilmEntry:
     """
@@ -207,7 +229,7 @@ class FilmEntry:
     :param name: as the person knows it.
     :param ruler: measured length of the board's ruler line [m].
     :param held: what hands without a tag hold.
-    :param left_out: numbers of the trials, from 0, that are not used.
+    :param trials: what is changed about the trials that are found in it.
     """
 
     id: str = entry_field(_id)
@@ -217,8 +239,8 @@ class FilmEntry:
         _each('mark', MOST_CLICKS, lambda entry: entry.record(MarkEntry)), ())
     held: tuple[HeldEntry, ...] = entry_field(
         _each('held point', MOST_HANDS, lambda entry: entry.record(HeldEntry)), ())
-    left_out: tuple[int, ...] = entry_field(
-        _each('trial', MOST_TRIALS, lambda entry: entry.whole(0, MOST_TRIALS)), ())
+    trials: tuple[FilmedTrialEntry, ...] = entry_field(
+        _each('trial', MOST_TRIALS, lambda entry: entry.record(FilmedTrialEntry)), ())
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import numpy as np
 
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.observation.episodes import Episode, episodes
+from dlo_calibration.observation.episodes import Bounds, Episode, episodes
 from dlo_calibration.observation.sightings import HandSightings, Sightings
 from dlo_calibration.vision.observer import ImageView
 from dlo_calibration.vision.tags import tag_path, TagPose
@@ -44,7 +44,7 @@ class Filming:
     held: Sequence[HeldPoint] = ()
     times: list[float] = field(default_factory=list)
     _views: list[ImageView] = field(default_factory=list)
-    _points: list[Floats] = field(default_factory=list)  # measured in space
+    _measured: list[Floats | None] = field(default_factory=list)  # points in space; None: without depth
     _diameters: list[float] = field(default_factory=list)
 
     def add(self, view: ImageView, depth: Floats | None = None) -> Floats:
@@ -59,8 +59,7 @@ class Filming:
         points = view.points(self.radius, depth)
         self.times.append(view.time)
         self._views.append(view)
-        if depth is not None:
-            self._points.append(points)
+        self._measured.append(None if depth is None else points)
         return points
 
     @property
@@ -72,7 +71,7 @@ class Filming:
     def forget(self, until: float) -> None:
         """Forget what was seen before a time [s]."""
         first = int(np.searchsorted(self.times, until))
-        del self.times[:first], self._views[:first], self._points[:first]
+        del self.times[:first], self._views[:first], self._measured[:first]
 
     def sightings(self) -> Sightings:
         """
@@ -84,8 +83,11 @@ class Filming:
             raise InputError('film', 'no scale', 'the printed board on the table, or known points',
                              'lay the board beside the DLO and give --board, or give --scale')
         radius = self.radius
-        if self._points and len(self._points) == len(self._views):
-            return Sightings(np.array(self.times), np.stack(self._points), None, radius)
+        if any(points is not None for points in self._measured):
+            # With depth, an image without it shows nothing.
+            unseen = np.full_like(next(points for points in self._measured if points is not None), np.nan)
+            return Sightings(np.array(self.times), np.stack([
+                unseen if points is None else points for points in self._measured]), None, radius)
         points = np.stack([view.points(radius) for view in self._views])
         # Where the view of the table is unknown, nothing was seen of the DLO.
         scales = [view.scale for view in self._views]
@@ -107,15 +109,17 @@ class Filming:
         return (*hands, *(_held(seen, held, name)
                           for held, name in zip(self.held, names, strict=False)))
 
-    def episodes(self, count: int | None = None) -> tuple[tuple[Episode, ...], tuple[str, ...]]:
+    def episodes(self, count: int | None = None,
+                 bounds: Sequence[Bounds] = ()) -> tuple[tuple[Episode, ...], tuple[str, ...]]:
         """
         Return the episodes so far, and sentences about movements that make none.
 
         :param count: of points of their chains; None: as many as were tracked.
+        :param bounds: of those episodes that shall begin or end elsewhere.
         :raises InputError: where the scale is unknown.
         """
         seen = self.sightings()
-        return episodes(seen, self.hands(seen), count)
+        return episodes(seen, self.hands(seen), count, bounds)
 
 
 def _held(seen: Sightings, held: HeldPoint, name: str) -> HandSightings:

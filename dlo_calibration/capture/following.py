@@ -9,12 +9,12 @@ from concurrent.futures import CancelledError
 from copy import copy
 from dataclasses import dataclass
 import math
-from typing import Callable, Sequence
+from typing import Any, Callable, Sequence
 
 import numpy as np
 
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.capture.document import FilmEntry, MarkEntry
+from dlo_calibration.capture.document import FilmedTrialEntry, FilmEntry, MarkEntry
 from dlo_calibration.capture.filming import Filming, HeldPoint
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.image_topic import ImageTopic
@@ -23,7 +23,7 @@ from dlo_calibration.messages.collector import TrialCollector
 from dlo_calibration.messages.encoder import episode_messages
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.observation.episodes import Episode
+from dlo_calibration.observation.episodes import Bounds, Episode
 from dlo_calibration.vision.film import Film
 from dlo_calibration.vision.lens import Lens
 from dlo_calibration.vision.observer import ImageView, Observer
@@ -46,6 +46,12 @@ class FilmedTrial:
     episode: Episode
     trial: Trial
 
+    def changes(self, entry: FilmEntry) -> FilmedTrialEntry:
+        """Return what a person changed about it."""
+        hands = self.episode.hands
+        begin, end = min(hand.start for hand in hands), max(hand.end for hand in hands)
+        return next((own for own in entry.trials if begin <= own.at <= end), FilmedTrialEntry(begin))
+
     @property
     def zero(self) -> float:
         """The time of the film at which the times of the trial begin [s]."""
@@ -56,18 +62,19 @@ class FilmedTrial:
 @dataclass(frozen=True, eq=False)
 class Followed:
     """
-    What a film shows.
+    Where the DLO is in each image of a film.
 
-    :param entry: with whose marks the DLO was followed.
+    :param marks: of the DLO, with which it was followed.
+    :param ruler: measured length of the board's ruler line [m], likewise.
+    :param lens: as it was given, likewise; None: the views of the board give the focal length.
     :param views: of all images, in the order of time.
-    :param radius: of the DLO [m]; 0: unknown.
     :param problems: in sentences.
     """
 
-    entry: FilmEntry
+    marks: tuple[MarkEntry, ...]
+    ruler: float
+    lens: Lens | None
     views: tuple[ImageView, ...]
-    radius: float
-    trials: tuple[FilmedTrial, ...]
     problems: tuple[str, ...]
 
     @property
@@ -75,38 +82,71 @@ class Followed:
         """The number of images in which the DLO was not lost."""
         return sum(not view.tracked.lost for view in self.views)
 
+    def outdated(self, entry: FilmEntry, lens: Lens | None) -> bool:
+        """Return whether the marks, the ruler or the lens have changed since."""
+        return (self.marks, self.ruler, plain_lens(self.lens)) != (entry.marks, entry.ruler, plain_lens(lens))
+
     def scale_at(self, time: float) -> Scale | None:
         """Return the scale of the image at a time [s]."""
         times = [view.time for view in self.views]
         return self.views[min(int(np.searchsorted(times, time)), len(times) - 1)].scale if times else None
 
 
-def follow(film: Film, entry: FilmEntry, count: int, lens: Lens | None = None, *,
+@dataclass(frozen=True, eq=False)
+class FilmCut:
+    """
+    The trials of a film.
+
+    :param radius: of the DLO [m]; 0: unknown.
+    :param problems: in sentences.
+    """
+
+    radius: float
+    trials: tuple[FilmedTrial, ...]
+    problems: tuple[str, ...]
+
+
+def follow(film: Film, entry: FilmEntry, lens: Lens | None = None, *,
            on_image: Callable[[int], None] = lambda done: None,
            should_stop: Callable[[], bool] = lambda: False) -> Followed:
     """
     Follow a DLO through a film, whose scale the printed board gives.
 
-    :param count: of points of the chains.
     :param lens: of the camera; None: the views of the board give the focal length.
     :param on_image: called with the number of images that are done.
     :raises InputError: where there are no marks, or nothing in the image of the first one.
     :raises CancelledError: when stopped.
     """
     problems = [WITHOUT_LENS] if lens is None else []
-    lens = film_lens(film, entry.ruler) if lens is None else lens.resized(film.size)
+    used = film_lens(film, entry.ruler) if lens is None else lens.resized(film.size)
 
     def counted(done: int) -> None:
         on_image(done)
         if should_stop():
             raise CancelledError
 
-    views = views_of(film, entry.marks, BoardFinder(lens, entry.ruler), problems, counted)
+    views = views_of(film, entry.marks, BoardFinder(used, entry.ruler), problems, counted)
+    return Followed(entry.marks, entry.ruler, lens, tuple(views), tuple(problems))
+
+
+def cut(followed: Followed, entry: FilmEntry, count: int) -> FilmCut:
+    """
+    Return the trials of a film, with the held points and the bounds that a person gives.
+
+    :param count: of points of their chains.
+    """
     filming = Filming(tuple(HeldPoint(held.place, held.height) for held in entry.held))
-    for view in views:
+    for view in followed.views:
         filming.add(view)
-    trials = filmed_trials(filming, count, problems)
-    return Followed(entry, tuple(views), filming.radius, trials, tuple(problems))
+    problems: list[str] = []
+    bounds = [Bounds(own.at, own.start, own.end) for own in entry.trials]
+    return FilmCut(filming.radius, filmed_trials(filming, count, problems, bounds), tuple(problems))
+
+
+def plain_lens(lens: Lens | None) -> Any:
+    """Return a lens as plain values."""
+    return None if lens is None else [
+        list(lens.size), lens.matrix.tolist(), lens.coefficients.tolist(), lens.fisheye]
 
 
 def views_of(film: Film | ImageTopic, marks: Sequence[MarkEntry], scale: Scale | BoardFinder | None,
@@ -156,17 +196,19 @@ def views_of(film: Film | ImageTopic, marks: Sequence[MarkEntry], scale: Scale |
     return earlier[::-1] + views
 
 
-def filmed_trials(filming: Filming, count: int, problems: list[str]) -> tuple[FilmedTrial, ...]:
+def filmed_trials(filming: Filming, count: int, problems: list[str],
+                  bounds: Sequence[Bounds] = ()) -> tuple[FilmedTrial, ...]:
     """
     Return the trials of a film, as a reader of its session makes them; why there are none goes to `problems`.
 
     :param count: of points of their chains.
+    :param bounds: of those that shall begin or end elsewhere.
     """
     trials = []
     try:
-        cut, unused = filming.episodes(count)
+        found, unused = filming.episodes(count, bounds)
         problems += unused
-        for episode in cut:
+        for episode in found:
             trial = _trial(episode, problems)
             if trial is not None:
                 trials.append(FilmedTrial(episode, trial))

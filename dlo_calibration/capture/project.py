@@ -4,8 +4,8 @@
 """
 Project: a folder with everything that a person entered, which can be opened again.
 
-It holds `project.json` (the document), the original photographs and films, each named by its id, and
-`lens.yaml`.  Removed photographs keep their files, so that removing can be undone.
+It holds `project.json` (the document), the original photographs and films, each named by its id, where the
+DLO is in each film, and `lens.yaml`.  Removed photographs keep their files, so that removing can be undone.
 """
 
 from __future__ import annotations
@@ -52,6 +52,7 @@ MOST_OCTETS_OF_ALL = 4 * 2**30  # of these
 LENS_OCTETS = 2**20  # of a camera calibration
 IN_MEMORY = 3  # decoded photographs; one of 12 megapixels takes 36 MB
 FILM_SUFFIX = '.film'  # whatever its kind
+FOLLOWED_SUFFIX = '.npz'
 SUFFIXES = {b'\xff\xd8\xff': '.jpg', b'\x89PN': '.png'}  # first bytes of a file -> its suffix
 
 
@@ -180,6 +181,10 @@ class Project:
                 return path
         raise InputError(f'film {identity}', 'no file in the folder of the project', 'its film',
                          'add it again')
+
+    def followed_path(self, identity: str) -> Path:
+        """Return the file of where the DLO is in a film, given by its id."""
+        return self.folder / FILMS / f'{identity}{FOLLOWED_SUFFIX}'
 
     def film(self, identity: str) -> Film:
         """Return a film, given by its id."""

@@ -55,6 +55,7 @@ class TrialDraft:
     :param trial: as a session records it; None: it is incomplete or wrong.
     :param movements: of the hands; None: unknown.
     :param hangs: between two clamps.
+    :param name: as the person calls it; empty: by its number.
     """
 
     warnings: TrialWarnings
@@ -63,12 +64,14 @@ class TrialDraft:
     movements: Movements | None = None
     trial: Trial | None = None
     hangs: bool = False
+    name: str = ''
 
     @cached_property
     def plain(self) -> dict[str, Any]:
         """The draft as plain values, for the page."""
         hands = () if self.movements is None else self.movements.hands
-        return {'complete': self.trial is not None, 'warnings': plain(tuple(self.warnings)),
+        return {'name': self.name, 'complete': self.trial is not None,
+                'warnings': plain(tuple(self.warnings)),
                 'hands': [{'name': hand.name, 'times': hand.times.tolist(),
                            'start_pixels': _pixels(self.start, hand.positions),
                            'goal_pixels': _pixels(self.goal, hand.positions)} for hand in hands]}

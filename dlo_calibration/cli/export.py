@@ -21,7 +21,7 @@ from dlo_calibration.export.rope import ExportedRope
 from dlo_calibration.export.usd import FORMS as USD_FORMS
 from dlo_calibration.files.chain_file import read_chain_file
 from dlo_calibration.files.result import read_result
-from dlo_calibration.writing import write_file
+from dlo_calibration.writing import make_folder, write_file
 
 DRAWS_TABLE = 'draws.csv'
 UNDETERMINED = ('keep', 'vary')
@@ -64,8 +64,10 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     options = replace(description.file_options, values=recorded).options(given_options(chosen))
     chain = read_chain_file(chosen.start)
     form = {} if chosen.form is None else {'form': chosen.form}
-    texts = {chosen.output: ''}
+    texts, drawn = {chosen.output: ''}, [description]
     if chosen.draws is None:
+        if chosen.undetermined != UNDETERMINED[0]:
+            raise InputError('--undetermined', 'no draws', '--draws N', 'say how many')
         texts[chosen.output] = export(description, chain, options=options, **form)
     else:
         drawn = drawn_dlos(description, chain, options, chosen.draws, chosen.seed,
@@ -73,13 +75,14 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
         texts = {chosen.output.with_stem(f'{chosen.output.stem}_{k}'):
                  export(dlo, chain, options=options, **form)
                  for k, dlo in enumerate(drawn, start=1)}
+    make_folder(chosen.output.parent)
     for name, content in sdf_meshes(options).items() if chosen.format == 'sdf' else ():
         write_file(chosen.output.parent / name, content)
     for path, text in texts.items():
         write_file(path, text)
     if chosen.draws is not None:
         write_file(chosen.output.parent / DRAWS_TABLE, draws_table(drawn, [path.name for path in texts]))
-    for warning in ExportedRope.of(description, chain, options).warnings:
+    for warning in ExportedRope.of(drawn[0], chain, options).warnings:
         print_message(warning)
     first, *_, last = *texts, *texts
     print_message(f'the DLO is in {chosen.output}' if chosen.draws is None else

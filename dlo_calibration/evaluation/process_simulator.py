@@ -60,14 +60,10 @@ class ProcessSimulator(TogetherSimulator):
         self.name = name
         self._make, self._content, self._answer_limit, self._finer = make, content, answer_limit, finer
         self._idle: list[_Process] = []
-        #: number of processes that were started in advance
-        self.processes = 1
 
-    def start(self, processes: int) -> None:
-        """Start processes now, so that they load the simulator in the background."""
-        self.processes = processes
-        for _ in range(processes):
-            self._idle.append(self._process())
+    def start(self) -> None:
+        """Start a process now, so that it loads the simulator in the background."""
+        self._idle.append(self._process())
 
     def simulate_together(self, jobs: Sequence[Job], stop: Stop) -> list[Rollout | SimulationError]:
         """

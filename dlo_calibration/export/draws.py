@@ -42,18 +42,18 @@ def drawn_dlos(dlo: Description, chain: Chain, options: Options, count: int, see
     names = dlo.space.free
     open_ones = np.array([dlo.parameters[name].verdict == NOT_IDENTIFIABLE for name in names])
     posterior = Posterior.of(dlo).lying(chain, options)
-    values = posterior.drawn_values(count, seed)
+    values, highest = posterior.drawn_values(count, seed), np.full(len(names), np.inf)
+    if RADIUS in names and np.isfinite(posterior.thickest):
+        highest[names.index(RADIUS)] = max(BY_NAME[RADIUS].value(posterior.thickest), 0.0)
     values[:, open_ones] = posterior.values[open_ones]
     if vary:
         from scipy.special import ndtr  # slow to load
 
         lower, upper = (np.array([getattr(dlo.parameters[name], end) for name in names])
                         for end in ('lower', 'upper'))
-        evenly = lower + ndtr(posterior.standard_draws(count, seed)) * (upper - lower)
-        values[:, open_ones] = evenly[:, open_ones]
-    if RADIUS in names and np.isfinite(posterior.thickest):
-        column = values[:, names.index(RADIUS)]
-        column[:] = np.minimum(column, max(BY_NAME[RADIUS].value(posterior.thickest), 0.0))
+        share = ndtr(posterior.standard_draws(count, seed))
+        values[:, open_ones] = (lower + share * (np.minimum(upper, highest) - lower))[:, open_ones]
+    values = np.minimum(values, highest)
     return [replace(dlo, parameters={
         name: replace(dlo.parameters[name], value=value, physical_value=dlo.space.reported(name, value)[0],
                       verdict=dlo.parameters[name].verdict if kept else DRAWN)

@@ -119,12 +119,12 @@ def candidates(trials: Sequence[Trial]) -> Iterator[Candidate]:
         across = np.array([0.0, 1.0, 0.0])
     side = tuple((across / np.linalg.norm(across)).tolist())
     gap = float(np.linalg.norm(along))
-    cm = _centimetres(0.3 * length)
+    cm = centimetres(0.3 * length)
     for fraction, place in ((0.0, 'the first end'), (0.5, 'the middle')):
         height = 0.4 * length
-        yield from _candidate(f'lift {place} by {_centimetres(height)} and hold it', chain,
+        yield from _candidate(f'lift {place} by {centimetres(height)} and hold it', chain,
                               LiftAndHold(fraction=fraction, height=height))
-        yield from _candidate(f'lift {place} by {_centimetres(height)} and watch it while it moves', chain,
+        yield from _candidate(f'lift {place} by {centimetres(height)} and watch it while it moves', chain,
                               LiftAndHold(fraction=fraction, height=height, speed=0.5), watched=True)
     for fraction, place in ((0.0, 'the first end'), (0.25, 'a quarter of the length'), (0.5, 'the middle')):
         yield from _candidate(f'drag {place} sideways by {cm}', chain,
@@ -136,16 +136,17 @@ def candidates(trials: Sequence[Trial]) -> Iterator[Candidate]:
         GraspAndPlace(fraction=0.0, to=_beyond(chain, 0.7, across)))
     if gap < 0.05 * length:
         return  # the ends touch each other, so that no direction is defined
-    yield from _candidate(f'grip both ends and push them {_centimetres(gap / 3)} together', chain,
+    yield from _candidate(f'grip both ends and push them {centimetres(gap / 3)} together', chain,
                           TwoHands(fractions=(0.0, 1.0), motion='together', distance=gap / 3))
     stretch = 1.03 * length - gap
     if stretch > 0:
         yield from _candidate(
-            f'grip both ends and pull them {_centimetres(stretch)} apart, 3 % beyond the straight DLO', chain,
+            f'grip both ends and pull them {centimetres(stretch)} apart, 3 % beyond the straight DLO', chain,
             TwoHands(fractions=(0.0, 1.0), motion='apart', distance=stretch))
 
 
-def _centimetres(length: float) -> str:
+def centimetres(length: float) -> str:
+    """Return a length [m] for people, with two digits."""
     return f'{number(float(f"{100 * length:.2g}"))} cm'
 
 

@@ -13,7 +13,8 @@ wide intervals.  Only the search for the best values is shorter, and fewer goals
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Sequence
+from itertools import islice
+from typing import Any, Iterator, Sequence
 import zlib
 
 import numpy as np
@@ -25,18 +26,19 @@ from dlo_calibration.evaluation.linearisation import (
     information,
     Linearisation,
     standard_deviations,
-    STEP,
     WIDEST,
 )
 from dlo_calibration.evaluation.pool import Pool
 from dlo_calibration.evaluation.residuals import Huber, ResidualLayout
 from dlo_calibration.inference.draws import drawn_points
-from dlo_calibration.inference.examination import Examination, extended
+from dlo_calibration.inference.examination import Examination, extended, SHORTEST
 from dlo_calibration.inference.outlier import candidate, is_outlier, SOMETHING_ELSE
 from dlo_calibration.inference.uncertainty import (
     at_minimum,
+    DEVIATIONS,
     HARDLY,
     IDENTIFIABLE,
+    MODEL_ERROR,
     NOT_IDENTIFIABLE,
     optimum_shift,
     prior_information,
@@ -59,11 +61,11 @@ from dlo_calibration.model.trial import Goal, shown_goals, Trial
 from dlo_calibration.observation.excitation import excites
 from dlo_calibration.observation.noise import NO_NOISE, with_other_noise
 
-ROUNDS = 8  # Gauss-Newton steps to the best values, at most
-WORTH_A_STEP = 0.02  # share of the cost that a step must promise to save
-WORTH_A_MOVE = 0.1  # share of the cost that one of the values TRIED must save
+ROUNDS = 12  # Gauss-Newton steps to the best values, at most
+# Logarithms of the likelihood: a parameter that is off by a standard deviation costs 0.5.
+WORTH_A_STEP = 0.1  # that a step must promise to save
+WORTH_A_MOVE = 0.5  # that one of the values TRIED must save
 TRIED = 0.15, 0.25  # the first value, and from one to the next, where a derivative may not point to the best
-MISFIT = 2.0  # times the noise level: larger residuals let the best values be sought all over the scales
 SCATTERED = 24  # points there
 STARTS = 8  # simulations of each trial from initial chains with other noise
 #: A trial is informative if it reduces a standard deviation below this share; repeating one leaves 0.71.
@@ -180,6 +182,7 @@ class TrialModel:
     The simulations of one trial.
 
     :param fit: linear model of its residuals.
+    :param steps: (d,) of its derivatives.
     :param moved: (STARTS, m) change of the residuals [m] by other noise of the initial chain.
     :param finer: (m,) change of the residuals [m] by a finer simulation.
     :param complete: False: `moved` and `finer` are not simulated yet; until then, and where they cannot be
@@ -187,14 +190,16 @@ class TrialModel:
     """
 
     fit: Linearisation
+    steps: Floats
     moved: Floats
     finer: Floats
     complete: bool = False
 
-    def near(self, point: Floats) -> bool:
-        """Tell whether the model holds at a (d,) point, in the parameters that the trial shows."""
+    def holds(self, point: Floats, steps: Floats) -> bool:
+        """Tell whether the model suits a (d,) point and steps there, in the parameters that it shows."""
+        away = np.abs(point - self.fit.point) > self.steps / 2
         shown = np.any(self.fit.jacobian != 0, axis=0)
-        return bool((np.abs(point - self.fit.point)[shown] <= STEP).all())
+        return not np.any((away | (self.steps > 2 * steps)) & shown)
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,11 +312,11 @@ class Appraiser:
         """
         trials = [without_repeated_goals(trial) for trial in trials]
         models = [*before.models, *[None] * (len(trials) - len(before.models))]
-        best = self._minimum(trials, models, before.point, before.uncertainty.std)
+        best = self._minimum(trials, models, before.point, before.promised)
         for better_start in (self._better_start, self._scattered_start):
             elsewhere = better_start(trials, best)
             if elsewhere is not None:
-                other = self._minimum(trials, [None] * len(trials), elsewhere, before.uncertainty.std)
+                other = self._minimum(trials, [None] * len(trials), elsewhere, before.promised)
                 best = min(best, other, key=lambda minimum: best.loss.cost(minimum.residuals))
         return self._examined(before.names, trials, best.point, tuple(
             model if model.complete else self._completed(model, trial)
@@ -328,8 +333,9 @@ class Appraiser:
         best: _Minimum | None = None
         for _ in range(ROUNDS):
             try:
-                now = tuple(model if model is not None and model.near(point) else
-                            self._model(trial, point, std)
+                steps = steps_within(std)
+                now = tuple(model if model is not None and model.holds(point, steps) else
+                            self._model(trial, point, steps)
                             for model, trial in zip(models, trials, strict=True))
             except SimulationError:
                 if best is None:
@@ -339,7 +345,7 @@ class Appraiser:
             models = now
             fit, layout = _joint_model(now, trials, point)
             loss = Huber.of(fit.residuals)
-            if best is not None:
+            if best is not None and not np.array_equal(point, best.point):
                 same = min(loss, best.loss)
                 if same.cost(fit.residuals) > same.cost(best.residuals):  # too far
                     point = (point + best.point) / 2
@@ -347,12 +353,14 @@ class Appraiser:
             uncertainty = at_minimum(fit, layout, noise=self.noise)
             best = _Minimum(fit.residuals, point, now, uncertainty)
             weighted = fit.weighted(loss.roots(fit.residuals) / uncertainty.scale)
-            step = weighted.step(prior_information(len(point)))
+            prior = prior_information(len(point))
+            step, std = weighted.step(prior), standard_deviations(weighted.information + prior)
             there = np.clip(point + np.clip(step, -WIDEST, WIDEST), 0.0, self.space.upper)
             saved = loss.cost(fit.residuals) - loss.cost(fit.predicted(there - point))
-            if saved < WORTH_A_STEP * loss.cost(fit.residuals):
+            if saved > WORTH_A_STEP * uncertainty.scale**2:
+                point = there
+            elif all(model.holds(point, steps_within(std)) for model in now):
                 break
-            point, std = there, uncertainty.std
         assert best is not None
         return best
 
@@ -365,74 +373,80 @@ class Appraiser:
         """
         shown = np.logical_or.reduce(excites(trials, self.space, self.table_height))
         start, cost = best.point, best.loss.cost(best.residuals)
+        worth = WORTH_A_MOVE * best.uncertainty.scale**2
         for k, name in enumerate(self.space.free):
             if name not in self.guessed or not shown[k] or best.uncertainty.verdicts[k] != NOT_IDENTIFIABLE:
                 continue
             values = np.arange(TRIED[0], self.space.upper[k], TRIED[1])
             points = [np.where(np.arange(len(start)) == k, value, start) for value in values]
-            costs = [best.loss.cost(self._residuals(trials, point)) for point in points]
-            if min(costs) < (1 - WORTH_A_MOVE) * cost:
+            costs = self._costs(trials, points, best.loss)
+            if min(costs) < cost - worth:
                 start, cost = points[int(np.argmin(costs))], min(costs)
         return None if start is best.point else start
 
     def _scattered_start(self, trials: Sequence[Trial], best: _Minimum) -> Floats | None:
         """Return the best of (d,) points all over the scales if a minimum misses the trials by far."""
-        if not best.uncertainty.residual > MISFIT * self.noise:
+        if not best.uncertainty.residual > MODEL_ERROR * self.noise:
             return None
         points = drawn_points(best.point, Appraisal.before(self.space.free, best.point).uncertainty,
                               SCATTERED, 0)
-        residuals = [self._residuals(trials, point) for point in points]
-        costs = [np.inf if each is None else best.loss.cost(each) for each in residuals]
+        costs = self._costs(trials, points, best.loss)
         # A Gauss-Newton step moves a parameter by WIDEST: a point that fits worse may still lead further.
         return points[int(np.argmin(costs))] if np.isfinite(min(costs)) else None
 
     def _examined(self, names: tuple[str, ...], trials: Sequence[Trial], point: Floats,
                   models: tuple[TrialModel, ...]) -> Appraisal:
         fit, layout = _joint_model(models, trials, point)
-        here = self._residuals(trials, point)  # where a trial is nonlinear, its model is off
+        here, = self._residuals(trials, [point])  # where a trial is nonlinear, its model is off
         fit = fit if here is None else replace(fit, residuals=here)
         shift = optimum_shift(fit, fit.residuals + np.concatenate([model.finer for model in models]))
         starts = fit.residuals + np.hstack([model.moved for model in models])
         uncertainty = at_minimum(fit, layout, noise=self.noise, shift=shift, starts=starts)
         fading = np.array([name not in REST_SHAPE for name in self.space.free])
         return Appraisal(names, point, extended(
-            fit, uncertainty, lambda points: [self._residuals(trials, beside) for beside in points], fading),
-            models)
+            fit, uncertainty, lambda points: self._residuals(trials, points), fading), models)
 
-    def _residuals(self, trials: Sequence[Trial], point: Floats) -> Floats | None:
-        """Return the residuals (m,) [m] of all trials at a (d,) point; None if one cannot be simulated."""
-        try:
-            return np.concatenate([self._simulated(trial, point) for trial in trials])
-        except SimulationError:
-            return None
+    def _costs(self, trials: Sequence[Trial], points: Sequence[Floats] | Floats, loss: Huber) -> list[float]:
+        """Return the cost [m^2] of all trials at each of the points; inf where one cannot be simulated."""
+        return [np.inf if each is None else loss.cost(each) for each in self._residuals(trials, points)]
 
-    def _simulated(self, trial: Trial, point: Floats, pool: Pool | None = None) -> Floats:
-        here, = self._all_simulated(trial, point[None], pool)
-        return here
+    def _residuals(self, trials: Sequence[Trial], points: Sequence[Floats] | Floats) -> list[Floats | None]:
+        """Return the residuals (m,) [m] of all trials at each point; None where one cannot be simulated."""
+        outcomes = self._outcomes([(trial, point) for point in points for trial in trials])
+        each = [[one for one in islice(outcomes, len(trials)) if not isinstance(one, SimulationError)]
+                for _ in points]
+        return [np.concatenate(some) if len(some) == len(trials) else None for some in each]
 
-    def _all_simulated(self, trial: Trial, points: Floats, pool: Pool | None = None) -> list[Floats]:
+    def _simulated(self, jobs: Sequence[tuple[Trial, Floats]], pool: Pool | None = None) -> list[Floats]:
         """
-        Return the residuals (m,) [m] of a trial at each of (n, d) points.
+        Return the residuals (m,) [m] of each trial at its (d,) point.
 
-        :raises SimulationError: if the trial cannot be simulated.
+        :raises SimulationError: if one cannot be simulated.
         """
-        values = [self.space.physical(self.space.values(point), self.length) for point in points]
-        rollouts = (pool or self.pool).simulate(
-            [(with_hands(trial, physical), physical) for physical in values])
-        failure = next((rollout for rollout in rollouts if isinstance(rollout, SimulationError)), None)
-        if failure is not None:
-            raise failure
-        return [np.append(residuals(trial, rollout.chains), force_residuals(trial, rollout.forces))
-                for rollout in rollouts if not isinstance(rollout, SimulationError)]
+        simulated = []
+        for outcome in self._outcomes(jobs, pool):
+            if isinstance(outcome, SimulationError):
+                raise outcome
+            simulated.append(outcome)
+        return simulated
 
-    def _model(self, trial: Trial, point: Floats, std: Floats) -> TrialModel:
+    def _outcomes(self, jobs: Sequence[tuple[Trial, Floats]], pool: Pool | None = None
+                  ) -> Iterator[Floats | SimulationError]:
+        """Yield the residuals (m,) [m] of each trial at its (d,) point, or why it cannot be simulated."""
+        values = [self.space.physical(self.space.values(point), self.length) for _, point in jobs]
+        rollouts = (pool or self.pool).simulate([
+            (with_hands(trial, each), each) for (trial, _), each in zip(jobs, values, strict=True)])
+        for (trial, _), rollout in zip(jobs, rollouts, strict=True):
+            yield rollout if isinstance(rollout, SimulationError) else np.append(
+                residuals(trial, rollout.chains), force_residuals(trial, rollout.forces))
+
+    def _model(self, trial: Trial, point: Floats, steps: Floats) -> TrialModel:
         """Simulate a trial around a (d,) point; a parameter that it certainly cannot show is not varied."""
-        here, shown = self._simulated(trial, point), excites([trial], self.space, self.table_height)[0]
-        # Steps of the standard deviations, as the chains may be nonlinear within such a distance.
-        sides = Differences.central(point, np.flatnonzero(shown), np.clip(std, STEP, WIDEST),
-                                    self.space.upper)
-        jacobian = sides.jacobian(np.zeros((len(here), len(point))), self._all_simulated(trial, sides.points))
-        return TrialModel(Linearisation(point, here, jacobian, self.space.upper),
+        shown = excites([trial], self.space, self.table_height)[0]
+        sides = Differences.central(point, np.flatnonzero(shown), steps, self.space.upper)
+        here, *beside = self._simulated([(trial, each) for each in (point, *sides.points)])
+        jacobian = sides.jacobian(np.zeros((len(here), len(point))), beside)
+        return TrialModel(Linearisation(point, here, jacobian, self.space.upper), steps,
                           np.zeros((STARTS, len(here))), np.zeros(len(here)))
 
     def _completed(self, model: TrialModel, trial: Trial) -> TrialModel:
@@ -441,16 +455,21 @@ class Appraiser:
         generator = np.random.default_rng(zlib.crc32(trial.initial.points.tobytes()))  # the same each time
         try:
             if self.noise > NO_NOISE and 'length_scale' not in self.space.free:
-                moved = np.array([self._simulated(noisy, point) - model.fit.residuals
-                                  for noisy, in with_other_noise([trial], self.noise, STARTS, generator)])
+                others = with_other_noise([trial], self.noise, STARTS, generator)
+                moved = np.array(self._simulated([(noisy, point) for noisy, in others])) - model.fit.residuals
             if fine is not None:
-                finer = self._simulated(trial, point, fine) - model.fit.residuals
+                finer = self._simulated([(trial, point)], fine)[0] - model.fit.residuals
         except SimulationError:
             pass
         finally:
             if fine is not None:
                 fine.simulator.close()
         return replace(model, moved=moved, finer=finer, complete=True)
+
+
+def steps_within(std: Floats) -> Floats:
+    """Return the steps (d,) of derivatives, to the ends of 90 % intervals: the chains may be nonlinear."""
+    return np.clip(DEVIATIONS * std, SHORTEST, WIDEST)
 
 
 def _joint_model(models: Sequence[TrialModel], trials: Sequence[Trial], point: Floats

@@ -12,7 +12,7 @@ into account:
 - the initial chain of each trial is measured with noise, too, and so are length and shape of the DLO;
 - if noise cannot explain the residuals, the trials may disagree with each other; the jackknife and
   the bootstrap over the trials measure how much more than by chance, and the larger of both counts; an
-  interval contains what the trials say without any one of them;
+  interval contains what the trials say without any one of them, unless that one alone tells the parameter;
 - the step and the nodes of the simulation move the optimum;
 - trials that look alike share the error of the model, so that repeating one averages only its noise;
 - chains and hands may have errors that change slowly, as those of a film, where their size is given;
@@ -42,6 +42,7 @@ HARDLY = 0.95  # of UNKNOWN_STD; trials that leave more inform about nothing
 IDENTIFIABLE_WIDTH, WEAK_WIDTH = 0.2, 0.4
 DEVIATIONS = 1.645  # half the width of a 90 % interval, in standard deviations of a normal distribution
 DISAGREEMENT = 1.05  # from this multiple of the noise level on, trials may disagree
+ALONE = 8.0  # from so many times its standard deviation on, the trials that are left hardly tell a parameter
 MODEL_ERROR = 1.6  # noise alone does not explain residuals that exceed the noise level by this factor
 SIMILAR = 0.8  # least cosine between the derivatives of similar trials; different actions stay below 0.5
 INVOLVED = 0.3  # a parameter belongs to a combination if its share of the unit vector is at least this
@@ -159,7 +160,11 @@ class Uncertainty:
 
     @property
     def undetermined(self) -> tuple[Floats, ...]:
-        """Unit vectors (d,) of combinations of two or more parameters that are not identifiable."""
+        """
+        Unit vectors (d,) of combinations of two or more parameters that are not identifiable.
+
+        Where all combinations of the same parameters are not, none says more than that each of them is not.
+        """
         if self.covariance is None:
             return ()
         values, vectors = np.linalg.eigh(self.covariance)
@@ -167,7 +172,9 @@ class Uncertainty:
                     for value, vector in zip(values[::-1], vectors.T[::-1], strict=True)
                     if 2 * DEVIATIONS * np.sqrt(value) > IDENTIFIABLE_WIDTH
                     and (np.abs(vector) >= INVOLVED).sum() > 1]
-        return tuple(combined)
+        involved = [tuple(np.flatnonzero(np.abs(vector) >= INVOLVED)) for vector in combined]
+        return tuple(vector for vector, those in zip(combined, involved, strict=True)
+                     if involved.count(those) < len(those))
 
 
 def good_count(evaluations: int) -> int:
@@ -240,9 +247,9 @@ def at_minimum(fit: Linearisation, layout: ResidualLayout, *, noise: float = flo
         parts: Sequence[Rows] = layout.rows if len(groups) < 3 else [
             np.concatenate([np.r_[layout.rows[k]] for k in group]) for group in groups]
         count = len(parts)
-        without, by_chance = resampled(weighted, parts, prior, 1 - np.eye(count))
+        without, by_chance = disagreement(weighted, parts, prior, 1 - np.eye(count))
         if count >= 3:  # two say too little of a variance
-            drawn, drawn_by_chance = resampled(weighted, parts, prior, bootstrap_counts(count))
+            drawn, drawn_by_chance = disagreement(weighted, parts, prior, bootstrap_counts(count))
             extra = np.maximum.reduce([
                 (count - 1) * np.mean(without**2 - by_chance, axis=0),
                 np.mean(drawn**2 - drawn_by_chance, axis=0), extra])
@@ -391,6 +398,23 @@ def resampled(fit: Linearisation, groups: Sequence[Rows], prior: Floats,
     common = np.linalg.inv(fit.information + prior)
     scatter = np.tensordot(counts**2, informations, axes=1) - counted @ common @ counted
     return moved, np.asarray(np.einsum('nij,njk,nki->ni', inverses, scatter, inverses))
+
+
+def disagreement(fit: Linearisation, groups: Sequence[Rows], prior: Floats,
+                 counts: Floats) -> tuple[Floats, Floats]:
+    """
+    Return the same as `resampled`, but 0 for a parameter where those that count hardly tell it.
+
+    What moves it there is their own error: that of a trial that alone tells it, as of the one in which a
+    rope is taut, would have to be far larger than the residuals.
+    """
+    def variances(counted: Floats) -> Floats:
+        return np.diagonal(np.linalg.inv(counted + prior), axis1=-2, axis2=-1)
+
+    informations = np.array([fit.rows(rows).information for rows in groups])
+    told = variances(np.tensordot(counts, informations, axes=1)) < ALONE**2 * variances(fit.information)
+    moved, by_chance = resampled(fit, groups, prior, counts)
+    return moved * told, by_chance * told
 
 
 def correlation_length(residuals: Floats, layout: ResidualLayout) -> float:

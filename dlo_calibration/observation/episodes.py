@@ -34,6 +34,7 @@ MOVES = 0.010  # m/s; a DLO of which some points move faster moves
 NOISE, QUIET = 2.5, 0.25  # times the motion below which a DLO is in a quarter of all pictures
 MOVED = 0.005  # m; a shorter movement is none
 SHARE = 8  # of a DLO's points that are taken together when its motion is measured: one in so many
+LEAST = 0.3  # s of a rest, where a person wants less
 REST = 0.5  # s; a shorter rest is a pause of the same movement
 HIDDEN = 0.05  # share of the length to both sides of a grip that fingers hide
 #: A beam that is lifted by its diameter leaves the table at 6 to 12 diameters to either side, and with the
@@ -58,6 +59,8 @@ class Episode:
     :param places: share of the length at which each holds the DLO.
     :param goals: times [s] and points (m, 3) [m] of the DLO afterwards.
     :param moving: number of goals that show the DLO while it is moved.
+    :param latest_start: it could start as late as this [s], with `bounds`.
+    :param earliest_end: likewise [s].
     """
 
     start: float
@@ -67,18 +70,43 @@ class Episode:
     places: tuple[float, ...]
     goals: tuple[tuple[float, Floats], ...]
     moving: int
+    latest_start: float
+    earliest_end: float
 
 
-def episodes(seen: Sightings, hands: Sequence[HandSightings],
-             count: int | None = None) -> tuple[tuple[Episode, ...], tuple[str, ...]]:
+@dataclass(frozen=True)
+class Bounds:
+    """
+    From when to when an episode lasts, as a person wants it: at most to the movements before and after.
+
+    LEAST of the rests before and after its own movement is always in it.
+
+    :param at: an instant of its movement [s]; with none within REST of it, the bounds are without effect.
+    :param start: of the rest before [s]; None: as it is found.
+    :param end: of the rest after [s]; None: as it is found.
+    """
+
+    at: float
+    start: float | None = None
+    end: float | None = None
+
+
+def episodes(seen: Sightings, hands: Sequence[HandSightings], count: int | None = None,
+             bounds: Sequence[Bounds] = ()) -> tuple[tuple[Episode, ...], tuple[str, ...]]:
     """
     Return the episodes of a film, and a sentence about each movement that makes none.
 
     :param count: of points of their chains; None: as many as were seen.
+    :param bounds: of those episodes that shall begin or end elsewhere.
     """
     times, movements = seen.times, _movements(seen, _motion(seen))
-    rests = [pictures_between(times, max(times[before], times[first] - START), times[first] - SPAN)
-             for before, (first, _) in zip([0, *(last for _, last in movements)], movements, strict=False)]
+    wanted = [_bounds_of((times[first], times[last]), bounds) for first, last in movements]
+    rests = []
+    for k, (first, _) in enumerate(movements):
+        own, until = wanted[k].start, times[first] - SPAN
+        since = times[first] - START if own is None else min(own, until - LEAST)
+        before = movements[k - 1][1] if k else 0
+        rests.append(pictures_between(times, max(times[before], since), until))
     starts = {k: start for k, rest in enumerate(rests)
               if len(rest) and usable(start := _resting(seen.points[rest]))}
     held: dict[int, list[Grasp]] = {k: [] for k in starts}
@@ -99,19 +127,30 @@ def episodes(seen: Sightings, hands: Sequence[HandSightings],
                 raise InputError('movement', 'no tag that moves with the DLO' if hands else
                                  'no tag in the film', 'one on what moves it', 'glue a tag on what holds the '
                                  'DLO where it is seen, or click the point that is held (--held)')
-            cut.append(_episode(seen, held[k], starts[k], float(times[rests[k][0]]), last, after, count))
+            latest = max(float(times[first] - SPAN - LEAST), 0.0)
+            cut.append(_episode(seen, held[k], starts[k], (float(times[rests[k][0]]), latest), last, after,
+                                wanted[k].end, count))
         except InputError as error:
             problems.append(f'{times[first]:.1f} to {times[last]:.1f} s: {error}')
     return tuple(cut), tuple(problems)
 
 
-def _episode(seen: Sightings, grasps: Sequence[Grasp], start: Floats, since: float, last: int, after: int,
-             count: int | None) -> Episode:
+def _bounds_of(movement: tuple[float, float], bounds: Sequence[Bounds]) -> Bounds:
+    """Return the bounds of the episode of a movement between two instants [s]."""
+    begin, end = movement
+    away = [max(begin - own.at, own.at - end) for own in bounds]
+    return bounds[away.index(min(away))] if away and min(away) <= REST else Bounds(begin)
+
+
+def _episode(seen: Sightings, grasps: Sequence[Grasp], start: Floats, since: tuple[float, float], last: int,
+             after: int, end: float | None, count: int | None) -> Episode:
     """
     Return the episode of one movement.
 
-    :param start: the DLO at rest before (m, 3) [m], from the time `since` on [s].
+    :param start: the DLO at rest before (m, 3) [m].
+    :param since: from when on [s], and from when on at the latest.
     :param last: picture of this movement; `after`: the first one of the next.
+    :param end: until when the rest after it counts [s]; None: for a while.
     :raises InputError: where the DLO did not rest, or is not seen.
     """
     times = seen.times
@@ -119,8 +158,11 @@ def _episode(seen: Sightings, grasps: Sequence[Grasp], start: Floats, since: flo
     initial = Chain(_fewer(start, count))
     paths = [_path(seen, grasp, initial) for grasp in grasps]
     begin = times[max(last, opens)] + SPAN
-    begin += LEAVES if times[after] - begin > LEAVES + END else 0.0
-    settled = pictures_between(times, begin, min(begin + END, times[after]))
+    earliest = float(begin + LEAST)
+    if times[after] - begin > LEAVES + END and (end is None or end > begin + LEAVES + LEAST):
+        begin += LEAVES
+    until = begin + END if end is None else max(end, begin + LEAST)
+    settled = pictures_between(times, begin, min(until, times[after]))
     settled = settled[(settled <= after) & (settled > opens)]
     if not len(settled):
         raise InputError('movement', 'a film that ends, or a next movement that begins, before the DLO rests',
@@ -135,8 +177,8 @@ def _episode(seen: Sightings, grasps: Sequence[Grasp], start: Floats, since: flo
         raise InputError('movement', 'a DLO of which less than half is seen afterwards', 'the whole DLO',
                          'take the hand away after each movement')
     chains = [(time, _fewer(points, count)) for time, points in (*goals, *chains)]
-    return Episode(since, chains[-1][0], initial, tuple(paths),
-                   tuple(grasp.place for grasp in grasps), tuple(chains), len(goals))
+    return Episode(since[0], chains[-1][0], initial, tuple(paths),
+                   tuple(grasp.place for grasp in grasps), tuple(chains), len(goals), since[1], earliest)
 
 
 def _fewer(points: Floats, count: int | None) -> Floats:

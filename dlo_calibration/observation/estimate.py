@@ -19,7 +19,7 @@ from dlo_calibration.model.chain import bezier_curve, Chain, Floats, frozen_arra
 from dlo_calibration.model.parameters import BY_NAME, GRAVITY, owner, ParameterSpace, SCALE
 from dlo_calibration.model.trial import shown_goals, Trial
 from dlo_calibration.observation.noise import noise, smooth
-from dlo_calibration.observation.table import RESTING_BAND, resting_level
+from dlo_calibration.observation.table import resting_band, resting_level
 
 RANK = {'free': 0, 'pin': 1, 'unknown': 2}  # number of unknown vectors at an end
 #: LEVI_CIVITA[i, j, k] is component k of axis i x axis j.
@@ -367,7 +367,8 @@ def _resting(trials: Sequence[Trial], table_height: float | None, sigma: float
             if not hands:
                 lying.append(goal.chain)
         for chain in lying:
-            if level is not None and (chain.points[:, 2] < level + RESTING_BAND + SIGMAS * sigma).all() \
+            band = resting_band(chain.length) + SIGMAS * sigma
+            if level is not None and (chain.points[:, 2] < level + band).all() \
                     and not _near_itself(chain.points, places, sigma):
                 hold = max(hold, _friction_that_holds_bends(_smoothed(chain, sigma), 5 * sigma))
     return (_weighted_mean([(b.load, b.std) for b in balances]),

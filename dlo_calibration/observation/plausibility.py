@@ -24,7 +24,7 @@ from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.parameters import GRAVITY, measured, number
 from dlo_calibration.model.trial import Goal, shown_goals, Trial
 from dlo_calibration.observation.noise import noise, noise_of
-from dlo_calibration.observation.table import HANGING, lowest_level, RESTING_BAND
+from dlo_calibration.observation.table import HANGING, lowest_level, resting_band
 
 SHORTEST, LONGEST = 0.009, 16.5  # m; 1 cm to 15 m, measured with noise; half a metre in inches is 20
 UNITS = {'millimetres': 1e-3, 'centimetres': 1e-2, 'inches': 0.0254}
@@ -80,7 +80,7 @@ def observation_warnings(trials: Sequence[Trial], table_height: float | None, ma
             'the chains', f'a noise of {measured(sigma, "m")} in each coordinate', f'at most '
             f'{measured(NOISY * length, "m")}, {100 * NOISY:g} % of the length',
             'average several views, light the DLO better, or bring the camera nearer')))
-    flat = max(RESTING_BAND, 6 * sigma)
+    flat = max(resting_band(length), 6 * sigma)
     levels = [float(np.median(trial.initial.points[:, 2])) for trial in trials
               if trial.velocity is None and np.ptp(trial.initial.points[:, 2]) <= flat]
     if not levels or table_height is None:
@@ -192,7 +192,7 @@ def _wrong_place(chain: Chain, hands: Sequence[Hand], table_height: float | None
     aside = _beside(chain, hands)
     if aside <= BESIDE:
         return None
-    if table_height is not None and np.ptp(z) <= max(RESTING_BAND, 2 * margin):
+    if table_height is not None and np.ptp(z) <= max(resting_band(chain.length), 2 * margin):
         return _in_the_air(level, table_height)
     return (f'whose centre of mass is {math.degrees(aside):.0f} degrees from straight below the hands',
             'it below them', 'set frame_pose so that z is up, number all points that a hand grips in the '
@@ -230,7 +230,7 @@ def _tilt(chain: Chain, margin: float) -> float:
 def _lies_flat(chain: Chain, hands: Sequence[Hand], margin: float) -> bool:
     """Return whether a chain lies: level and bent, with a single hand, so that its other end would sag."""
     points = chain.points
-    if len(hands) > 1 or np.ptp(points[:, 2]) > max(RESTING_BAND, 2 * margin):
+    if len(hands) > 1 or np.ptp(points[:, 2]) > max(resting_band(chain.length), 2 * margin):
         return False
     return bool(np.linalg.norm(points[-1] - points[0]) < 0.98 * chain.length)
 

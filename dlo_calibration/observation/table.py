@@ -12,8 +12,8 @@ from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.trial import Trial
 
 HANGING = 0.04  # m; a DLO whose lowest points are higher above the table hangs
-RESTING_BAND = 0.006  # m; points of a resting chain are at most this much above its lowest one
-STACKED = 0.0015  # m; of two strands that cross, one that is higher by this lies on the other
+RESTING_BAND = 0.006, 0.02  # m, and share of the length; points at rest are at most so far above the lowest
+STACKED = 0.0015, 0.005  # likewise; of two strands that cross, one that is higher by this lies on the other
 RISEN = 0.25  # share of its height above the other strand above which a point of the upper strand is raised
 
 
@@ -37,10 +37,16 @@ def lying_level(chain: Chain, table_height: float) -> float | None:
     return level if level - table_height < HANGING else None
 
 
+def resting_band(length: float) -> float:
+    """Return how far points of a resting DLO of a length [m] are above its lowest one, at most [m]."""
+    most, share = RESTING_BAND
+    return min(most, share * length)
+
+
 def lowest_level(chain: Chain) -> float:
     """Return the median height [m] of the lowest points of a chain; infinity if there are too few of them."""
     z = chain.points[chain.seen, 2]
-    lowest = z[z < z.min() + RESTING_BAND]
+    lowest = z[z < z.min() + resting_band(chain.length)]
     return float(np.median(lowest)) if len(lowest) >= max(3, 0.15 * len(z)) else np.inf
 
 
@@ -48,14 +54,14 @@ def rest_on(points: Floats, level: float) -> Floats:
     """
     Return the (N, 3) [m] points, with those that rest moved exactly to `level`.
 
-    These are the points below the level, or above it by less than half of RESTING_BAND:
+    These are the points below the level, or above it by less than half of `resting_band`:
     a simulation then starts with no point inside the table, and none that falls onto it.
     A part that lies on another part of the DLO keeps its height, even if the DLO is thin: a
     simulation cannot know otherwise which part is above.
     """
-    rested = np.array(points)
-    resting = rested[:, 2] < level + RESTING_BAND / 2
-    resting &= ~_stacked(points, level) | (rested[:, 2] < level)
+    rested, length = np.array(points), float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+    resting = rested[:, 2] < level + resting_band(length) / 2
+    resting &= ~_stacked(points, level, min(STACKED[0], STACKED[1] * length)) | (rested[:, 2] < level)
     rested[resting, 2] = level
     return rested
 
@@ -81,21 +87,21 @@ def crossing_segments(points: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp
     return here[crossing], there[crossing], s[crossing], t[crossing]
 
 
-def _stacked(points: Floats, level: float) -> NDArray[np.bool_]:
+def _stacked(points: Floats, level: float, higher: float) -> NDArray[np.bool_]:
     """
     Return which (N, 3) [m] points belong to a part that lies on another part of the DLO, and rises for that.
 
-    It does where its segment is above one of the other's, and at least STACKED higher.
+    It does where its segment is above one of the other's, and at least `higher` [m].
     """
     rise = np.diff(points[:, 2])
     stacked = np.zeros(len(points), bool)
-    if np.ptp(points[:, 2]) < STACKED:
+    if np.ptp(points[:, 2]) < higher:
         return stacked
     for here, there, s, t in zip(*crossing_segments(points), strict=True):
-        higher = float(points[there, 2] + t * rise[there] - points[here, 2] - s * rise[here])
-        if abs(higher) >= STACKED:
-            raised = points[:, 2] > level + abs(higher) * RISEN
-            upper = int(there if higher > 0 else here)
+        above = float(points[there, 2] + t * rise[there] - points[here, 2] - s * rise[here])
+        if abs(above) >= higher:
+            raised = points[:, 2] > level + abs(above) * RISEN
+            upper = int(there if above > 0 else here)
             first, last = upper + 1, upper
             while first > 0 and raised[first - 1]:
                 first -= 1

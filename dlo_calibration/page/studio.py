@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 import threading
-from typing import Any, Mapping
+from typing import Any, Mapping, Sequence
 
 import numpy as np
 
@@ -45,7 +45,7 @@ from dlo_calibration.workspace.source import read_source, Selection
 from dlo_calibration.writing import make_folder, write_file
 
 MOST_ANIMATIONS = 8  # in memory
-LIFT = 0.1  # m, of an advised movement
+LIFT = 2.0  # times that of a robot, of an advised movement
 STILL = 1e-3  # m; a hand that moves less along the table goes up or down, or waits
 CHAIN_FILES = {'csv': chain_csv, 'xml': chain_xml}
 
@@ -369,15 +369,13 @@ class Studio:
             with suppress(InputError):  # a calibration is refused with the reason
                 self._write_scene(self.project.folder)
             self._information.want(trials, self._options({}), digest(*self._newest.obstacles),
-                                   self._limits())
+                                   self._limits(trials))
         return self._newest
 
     def _with_films(self, drafts: Drafts) -> Drafts:
         """Return drafts with the trials of the films behind those of the photographs."""
-        filmed = [TrialDraft(TrialWarnings(), trial=own.trial)
-                  for entry in self.project.document.films
-                  if (followed := self._film_room.followed.get(entry.id)) is not None
-                  for k, own in enumerate(followed.trials) if k not in entry.left_out]
+        filmed = [TrialDraft(TrialWarnings(), trial=own.trial, name=own.changes(entry).name)
+                  for entry in self.project.document.films for own in self._film_room.used(entry)]
         first = len(drafts.trials)
         named = [replace(draft, trial=draft.trial and replace(draft.trial, name=_name(first + k)))
                  for k, draft in enumerate(filmed)]
@@ -389,20 +387,18 @@ class Studio:
         if not drafts.trials or drafts.trials[-1].trial is None:
             return None
         for entry in reversed(self.project.document.films):
-            followed = self._film_room.followed.get(entry.id)
-            used = [own for k, own in enumerate(followed.trials if followed else ())
-                    if k not in entry.left_out]
-            if used and followed is not None:
-                scale = followed.scale_at(used[-1].zero + used[-1].trial.goals[-1].time)
+            used = self._film_room.used(entry)
+            if used:
+                scale = self._film_room.scale_at(entry.id, used[-1].zero + used[-1].trial.goals[-1].time)
                 return None if scale is None else (entry.id, scale)
         goal = self.project.document.trials[-1].goal or ''
         scale = drafts.photographs[goal].scale if goal in drafts.photographs else None
         return None if scale is None else (goal, scale)
 
-    def _limits(self) -> AdviceOptions | None:
+    def _limits(self, trials: Sequence[Trial]) -> AdviceOptions | None:
         """Return what a person's hand may do next: what the last picture shows, and not on the board."""
         view = None if self._newest is None else self._last_view(self._newest)
-        if view is None:
+        if view is None or not trials:
             return None
         width, height = view[1].size
         corners = view[1].points([(u, v) for u in (0.0, width - 1.0) for v in (0.0, height - 1.0)])
@@ -410,7 +406,8 @@ class Studio:
         reach = '' if np.isnan(corners).any() else \
             f'box {low[0]:.3f} {low[1]:.3f} -1 {high[0]:.3f} {high[1]:.3f} 1'
         boards = any(isinstance(entry.scale, BoardScale) for entry in self.project.document.photographs)
-        return AdviceOptions(height=LIFT, pause=0.0, reach_1=reach, no_go=(
+        lift = LIFT * AdviceOptions().of_length(trials[-1].initial.length).height
+        return AdviceOptions(height=lift, pause=0.0, reach_1=reach, no_go=(
             f'0 0 -1 {COLUMNS * SQUARE:.3f} {ROWS * SQUARE:.3f} 0.01',) * boards)
 
     def _advice(self) -> dict[str, Any] | None:

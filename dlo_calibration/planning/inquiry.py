@@ -11,6 +11,7 @@ from typing import Iterator, Mapping, Sequence
 import numpy as np
 
 from dlo_calibration.evaluation.pool import Pool
+from dlo_calibration.inference.advice import centimetres
 from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.trial import Goal, Trial
@@ -30,6 +31,7 @@ GRASPED = 0.6  # least share of the points that some hand reaches after an actio
 HEAP = 0.3  # share of the length; a DLO whose points are all nearer to each other lies in a heap
 SELDOM = 0.25  # share of the draws in which an action may end otherwise
 STEADY = 0.25  # s before the end of a pause, when hands and DLO rest
+UPRIGHT = 0.01  # share of the length; a hand that is carried less goes up and down
 TIDIER = 0.8  # of the distance from where it is tidy that an action must leave, at most
 
 
@@ -54,9 +56,9 @@ class Inquiry:
             way, kind = float(np.linalg.norm(shift)), self.move.name
             hand = next(hand for hand in self.action.hands if hand.name == name)
             lift = float(hand.positions[:, 2].max() - hand.positions[0, 2])
-            what = f'drag it by {100 * way:.0f} cm' if kind != LIFTING else \
-                f'lift it by {100 * lift:.0f} cm' + (f' and carry it by {100 * way:.0f} cm'
-                                                     if way > 0.005 else '')
+            what = f'drag it by {centimetres(way)}' if kind != LIFTING else \
+                f'lift it by {centimetres(lift)}' + (
+                    f' and carry it by {centimetres(way)}' if way > UPRIGHT * start.length else '')
             end = {0: 'the first end', int(np.abs(places - 0.5).argmin()): 'the middle',
                    len(places) - 1: 'the last end'}
             parts.append(f'{name}: grip {end.get(grip, f"{places[grip]:.2f} of the length")}, {what}')
@@ -75,7 +77,7 @@ class Inquiries:
     """
 
     def __init__(self, start: Chain, level: float, limits: AdviceOptions, surroundings: Surroundings) -> None:
-        self.start, self.limits = start, limits
+        self.start, self.limits = start, limits.of_length(start.length)
         self.refusals: dict[str, int] = {}
         self._regions, self._surroundings = limits.limits, surroundings
         self._levels = np.full(len(start), level)

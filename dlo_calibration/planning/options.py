@@ -5,7 +5,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 from dlo_calibration.calibration.options import declared, DeclaredOptions, MACHINE, SEARCH
 from dlo_calibration.errors import InputError
@@ -14,6 +15,9 @@ from dlo_calibration.planning.limits import HANDS, Limits, REACH
 
 KINDS = ('grasp_and_place', 'drag')  # of actions
 POINTS, SCORE = 'points', 'score'  # objectives
+SHORT = 0.3  # m; a DLO that is shorter is lifted less, and moved more slowly, in proportion
+LIFT, SPEED = 0.05, 0.1  # m, m/s; of a longer one
+SLOWEST = 1e-4  # m/s
 
 
 @dataclass(frozen=True)
@@ -25,9 +29,12 @@ class HandOptions(DeclaredOptions):
     kinds: tuple[str, ...] = declared(KINDS, 'the kinds of actions that the hands may do', choices=KINDS,
                                       of=SEARCH)
     crossings: bool = declared(False, 'whether an action may put the DLO over itself', of=SEARCH)
-    height: float = declared(0.05, 'lift of a grasp_and_place above the higher one of its two places',
-                             unit='m', minimum=0.001, maximum=10.0, of=MACHINE)
-    speed: float = declared(0.1, 'speed of the hands', unit='m/s', minimum=0.001, maximum=10.0, of=MACHINE)
+    height: float = declared(
+        0.0, f'lift of a grasp_and_place above the higher one of its two places; 0: {LIFT:g} m, for a DLO '
+        f'shorter than {SHORT:g} m a sixth of its length', unit='m', minimum=0.0, maximum=10.0, of=MACHINE)
+    speed: float = declared(
+        0.0, f'speed of the hands; 0: {SPEED:g} m/s, for a DLO shorter than {SHORT:g} m a third of its '
+        'length a second', unit='m/s', minimum=0.0, maximum=10.0, of=MACHINE)
     reach_1: str = declared(
         '', f'where hand_1 can be: {REACH}, in the frame of the table; empty: everywhere', of=MACHINE)
     reach_2: str = declared('', 'where hand_2 can be, as reach_1', of=MACHINE)
@@ -50,7 +57,15 @@ class HandOptions(DeclaredOptions):
         if not self.kinds or len(set(self.kinds)) < len(self.kinds):
             raise InputError('parameter kinds', f'{" ".join(self.kinds) or "no name"}',
                              'one or more different names', 'name each kind of action once')
+        if 0 < self.speed < SLOWEST:
+            raise InputError('parameter speed', f'{self.speed:g} m/s', f'0, or at least {SLOWEST:g} m/s',
+                             'let the hands move faster')
         self.limits  # noqa: B018
+
+    def of_length(self, length: float) -> Self:
+        """Return the options for a DLO of a length [m]: lift and speed are those of its length if open."""
+        share = min(1.0, length / SHORT)
+        return replace(self, height=self.height or share * LIFT, speed=self.speed or share * SPEED)
 
     @property
     def limits(self) -> Limits:

@@ -21,11 +21,12 @@ from dlo_calibration.evaluation.pool import Pool, Threads
 from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain, Floats, frozen_array
 from dlo_calibration.model.parameters import GRAVITY, natural_curvature
-from dlo_calibration.observation.table import HANGING, lying_level, RESTING_BAND
+from dlo_calibration.observation.table import HANGING, lying_level, resting_band
 from dlo_calibration.planning.action_loads import loads_of_actions
 from dlo_calibration.planning.beam import BeamSearch, JudgedSequence, Objective
 from dlo_calibration.planning.dlo import CalibratedDlo, intervals, Posterior
 from dlo_calibration.planning.limits import crossings, HANDS
+from dlo_calibration.planning.moves import HANDS_APART
 from dlo_calibration.planning.options import PlanOptions
 from dlo_calibration.planning.plan import Plan, PlannedAction
 from dlo_calibration.planning.rehearsal import ActionStep, RehearsalJob, Rehearser
@@ -116,9 +117,9 @@ def _level(thing: str, chain: Chain, table_height: float) -> float:
 def _rise_on_table(start: Chain, goal: Chain, simulation: Options) -> float:
     """Return how much higher the start lies on the table than the goal [m]; 0 if one lies on a body."""
     here, there = (lying_level(chain, simulation.table_height) for chain in (start, goal))
-    if not simulation.table or here is None or there is None or abs(here - there) > RESTING_BAND:
+    if not simulation.table or here is None or there is None:
         return 0.0
-    return here - there
+    return here - there if abs(here - there) <= resting_band(start.length) else 0.0
 
 
 def _levels(start: Chain, goal: Chain, simulation: Options) -> Floats:
@@ -127,7 +128,7 @@ def _levels(start: Chain, goal: Chain, simulation: Options) -> Floats:
     z = goal.points[:, 2]
     if level is None:
         return z
-    return np.where((np.abs(z - level) < RESTING_BAND) | (not simulation.scene), level, z)
+    return np.where((np.abs(z - level) < resting_band(start.length)) | (not simulation.scene), level, z)
 
 
 def _check_bodies(goal: Chain, surroundings: Surroundings) -> None:
@@ -166,6 +167,9 @@ def _warnings_of_limits(start: Chain, goal: Chain, options: PlanOptions) -> Iter
     start_within, goal_within = (np.any(
         [limits.reach[name].contains(chain.points, chain.points) for name in hands], axis=0)
         for chain in (start, goal))
+    if options.hands > 1 and start.length < HANDS_APART:
+        yield (f'hands stay {_mm(HANDS_APART)} apart, as grippers have a size, so two of them cannot grip a '
+               f'DLO of {_mm(start.length)} together, and each action is that of one hand')
     if not start_within.any():
         yield f'no point of the DLO is within the reach of {whose}, so nothing can move it'
     if not goal_within.all():
@@ -278,6 +282,7 @@ def plan(dlo: CalibratedDlo, start: Chain, goal: Chain, options: PlanOptions | N
     """
     options, simulation, begin = options or PlanOptions(), simulation or Options(), clock()
     start, goal = checked(dlo, start, goal, simulation, options)
+    options = options.of_length(start.length)
     surroundings = Surroundings.of(obstacles_of(simulation), options.clearance, start.points,
                                    goal.points)
     _check_bodies(goal, surroundings)

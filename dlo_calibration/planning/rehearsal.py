@@ -23,7 +23,7 @@ from dlo_calibration.simulation.protocol import Rollout, Simulator
 PAUSE = 1.0  # s from the end of an action to the start of the next; the DLO rests then, however long it takes
 CALM = 1.5  # s of the same in a motion, which does not wait for rest: a released DLO nearly rests by then
 REST = 0.01  # s from the end of an action to the goal at rest
-TRAJECTORY_STEP = 0.01  # m that a hand moves, at most, between two chains of a trajectory
+TRAJECTORY_STEP = 0.01, 1 / 30  # m, and share of the length, that a hand moves at most between two chains
 
 
 @dataclass(frozen=True)
@@ -96,22 +96,23 @@ def rehearsed_trial(start: Chain, steps: Sequence[ActionStep], trajectories: boo
                     loads: bool = False) -> Trial:
     """Return a trial with the actions in turn; its goals are the DLO at rest after each."""
     steps, goals = in_turn(steps), []
+    longest, share = TRAJECTORY_STEP
     for step in steps:
         action = step.action
         if trajectories:
-            times = _instants(action)
+            times = _instants(action, min(longest, share * start.length))
             names = (*step.held_by, *(hand.name for hand in action.hands))
             goals += [Goal(start, float(time), stable=False, held_by=names) for time in times]
         goals.append(Goal(start, action.end + REST, held_by=step.held_by))
     return Trial('rehearsal', start, tuple(step.action for step in steps), tuple(goals), loads=loads)
 
 
-def _instants(action: Action) -> Floats:
-    """Return instants [s] within an action, between which no hand moves further than TRAJECTORY_STEP."""
+def _instants(action: Action, longest: float) -> Floats:
+    """Return instants [s] within an action, between which no hand moves further than `longest` [m]."""
     speeds = [np.linalg.norm(np.diff(hand.positions, axis=0), axis=1) / np.diff(hand.times)
               for hand in action.hands]
     fastest = np.concatenate(speeds).max(initial=0.0)
-    pieces = int(np.ceil((action.end - action.start) * fastest / TRAJECTORY_STEP))
+    pieces = int(np.ceil((action.end - action.start) * fastest / longest))
     return np.linspace(action.start, action.end, pieces + 1)[1:-1]
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+import math
 from typing import Any, Mapping, TYPE_CHECKING
 
 import numpy as np
@@ -313,7 +314,8 @@ def _with_radius(curvature: float) -> str:
         else measured(curvature, '1/m')
 
 
-FLAT = 1e-3  # m; a hand that rises by less stays on the table
+FLAT = 1e-3, 1 / 300  # m, and share of the length; a hand that rises by less stays on the table
+SHORT = 0.3  # m; places of a shorter DLO are told with more digits
 
 
 def plan_sentences(plan: Plan) -> list[str]:
@@ -362,9 +364,10 @@ def outcome(plan: Plan) -> str:
 
 def prediction_sentences(prediction: Prediction) -> list[str]:
     """Return a sentence for each action, and the warnings."""
+    length = prediction.start.length
     return [*(f'{k}. {step.name}: {_hands(prediction.start, step)}; then the first point is at '
-              f'{_place(step.chain[0])} m, the last one at {_place(step.chain[-1])} m, and the 90 % '
-              f'intervals are {width(step)} wide on average'
+              f'{_place(step.chain[0], length)} m, the last one at {_place(step.chain[-1], length)} m, and '
+              f'the 90 % intervals are {width(step)} wide on average'
               f'{"" if step.settled else "; the DLO did not come to rest"}.'
               f'{_borne(prediction.start, step.loads)}'
               for k, step in enumerate(prediction.steps, start=1)), *prediction.warnings]
@@ -405,15 +408,18 @@ def _hand(start: Chain, hand: Hand, on_the_table: str, axes: int, after: str = '
     :param corners: whether to name the places where its way turns, seen from above.
     """
     places, rise = start.arc_lengths(), float(hand.positions[:, 2].max() - hand.positions[0, 2])
-    way = f'lifts {number(100 * rise)} cm, carries' if rise > FLAT else on_the_table
+    flat = min(FLAT[0], FLAT[1] * float(places[-1]))
+    way = f'lifts {number(100 * rise)} cm, carries' if rise > flat else on_the_table
     grip = grip_place(places, hand.grips[0], hand.offset) / places[-1]
     turns = [place for place in hand.positions[1:-1, :axes] if corners and not np.isclose(
         place[:2], hand.positions[[0, -1], :2]).all(axis=1).any()]
-    past = f'past {", ".join(map(_place, turns))} ' if turns else ''
+    past = f'past {", ".join(_place(turn, places[-1]) for turn in turns)} ' if turns else ''
     return (f'{hand.name} grips at {grip:.2f} of the length, {way} it {past}to '
-            f'{_place(hand.positions[-1, :axes])} m and {after}')
+            f'{_place(hand.positions[-1, :axes], places[-1])} m and {after}')
 
 
-def _place(point: Floats) -> str:
-    """Return a place, (2,) or (3,) [m], in words."""
-    return f'({", ".join(f"{coordinate:.3f}" for coordinate in point.round(3) + 0.0)})'  # no -0.000
+def _place(point: Floats, length: float) -> str:
+    """Return a place, (2,) or (3,) [m], in words; `length` of the DLO [m]."""
+    digits = 3 + max(0, math.ceil(math.log10(SHORT / length)))
+    rounded = point.round(digits) + 0.0  # no -0.000
+    return f'({", ".join(f"{coordinate:.{digits}f}" for coordinate in rounded)})'

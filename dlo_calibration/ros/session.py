@@ -118,6 +118,31 @@ class Dropped:
 
 
 @dataclass
+class Place:
+    """
+    Where a DLO is seen.
+
+    :param chain: the first one that shows it there.
+    :param told: whether that is an initial chain, so that the DLO rests.
+    :param since: stamp of that one, and `until` of the last one that shows it there [ns].
+    """
+
+    chain: Chain
+    told: bool
+    since: int
+    until: int
+
+
+def is_near(chain: Chain, other: Chain) -> bool:
+    """Tell whether two chains show a DLO at the same place."""
+    if len(chain) != len(other):
+        return False
+    away = np.linalg.norm(chain.observed - other.observed, axis=1)
+    away = away[np.isfinite(away)]
+    return len(away) > 0 and bool(away.mean() < ELSEWHERE)
+
+
+@dataclass
 class SessionState(NodeState):
     """
     What a reset forgets, besides the trials.
@@ -130,8 +155,9 @@ class SessionState(NodeState):
     :param markers: when to send the markers.
     :param renewal: when to renew `information`.
     :param advice: what to do next; None: unknown yet.
-    :param asked: where the DLO rested for which advice was sought last.
-    :param resting: the newest chain, where no action followed it.
+    :param asked: number of trials, and where the DLO rested, when advice was sought last.
+    :param seen: where the DLO was seen last; None: an action followed.
+    :param newest: stamp of the newest message that says where it is [ns].
     :param first: time of the first advice [s].
     :param minutes_left: until what is wanted is reached, at the speed so far; nan: unknown.
     """
@@ -146,8 +172,9 @@ class SessionState(NodeState):
     markers: Pace = field(default_factory=Pace)
     renewal: Pace = field(default_factory=Pace)
     advice: NextAction | None = None
-    asked: Chain | None = None
-    resting: Chain | None = None
+    asked: tuple[int, Chain] | None = None
+    seen: Place | None = None
+    newest: int = 0
     first: float | None = None
     minutes_left: float = float('nan')
 
@@ -260,6 +287,7 @@ class Outlet:
 
 
 ELSEWHERE = 0.01  # m that the points of a DLO at rest move on average, if it was moved
+LAID = 3.0  # s besides the pause of an action, for which a DLO lies still that no message says to rest
 QUIET = 0.5  # s without action or goal chain, after which the last trial counts as complete
 PATIENCE = 10.0  # s that closing waits for each worker
 UNDER_WAY = 1.0  # s for which messages from before a jump of the clock may still arrive
@@ -477,7 +505,7 @@ class CalibrationSession(NodeSession[CalibratorOptions]):
         self._calibration = CalibrationUnderWay(options, progress, state)
         state.started, state.name, state.detail = True, 'calibrating', log.resumed if log else ''
         self._live_information.stop()
-        state.renewal.wanted = True  # again after the calibration, as this one was stopped
+        state.renewal.wanted, state.asked = True, None  # again after the calibration, as this one was stopped
         self._worker.start(trials, options, log)
         return ' '.join(filter(None, [
             f'calibrating on {len(trials)} trial(s), at most {progress.evaluations} evaluations.',
@@ -577,54 +605,67 @@ class CalibrationSession(NodeSession[CalibratorOptions]):
         self._report()
 
     def _take_place(self, message: Message) -> None:
-        """Keep the newest chain, until an action moves the DLO."""
+        """Keep where the newest chain shows the DLO, until an action moves it."""
+        state = self._state
+        if message.stamp < state.newest:  # as of an action that a tracker tells when it is over
+            return
+        state.newest = message.stamp
+        if not isinstance(message, ChainMessage):
+            state.seen = None
+            return
         pose = self._collector.pose
-        self._state.resting = None if not isinstance(message, ChainMessage) else \
-            message.chain if pose is None else pose.chain(message.chain)
+        chain = message.chain if pose is None else pose.chain(message.chain)
+        if message.kind != INITIAL and state.seen is not None and is_near(state.seen.chain, chain):
+            state.seen.until = message.stamp
+        else:
+            state.seen = Place(chain, message.kind == INITIAL, message.stamp, message.stamp)
 
-    def _place(self) -> Chain | None:
-        """Return where the DLO rests, as far as is known; None while it moves, or a hand holds it."""
-        state, collector = self._state, self._collector
-        if state.resting is None or collector.incomplete or not collector.count:
-            return state.resting
-        goal = collector.trials[-1].goals[-1]
-        return goal.chain if goal.stable and not goal.held_by else None
+    def _place(self, quiet: bool) -> Chain | None:
+        """
+        Return where the DLO rests, as far as is known; None while it moves, or a hand holds it.
+
+        :param quiet: whether no message has come for a while; a stream itself must show that the DLO rests.
+        """
+        seen, collector = self._state.seen, self._collector
+        if seen is None or seen.told:
+            return None if seen is None else seen.chain
+        if collector.count and not collector.incomplete:
+            goal = collector.trials[-1].goals[-1]
+            if goal.held_by:
+                return None
+            if goal.stable and (quiet or goal.count > 1) and is_near(seen.chain, goal.chain):
+                return goal.chain
+        lain = (seen.until - seen.since) / NANOSECONDS
+        return seen.chain if lain > self._graph.options().pause + LAID else None
 
     def _renew_information(self) -> None:
-        """Take new information; begin to renew it if trials have changed and no calibration is under way."""
+        """
+        Take new information; renew it if trials have changed, and seek advice if the DLO rests elsewhere.
+
+        None of that begins while a calibration is under way.
+        """
         state, now = self._state, self._clock()
         for event in self._live_information.waiting_events():
             if isinstance(event, NextAction):
                 self._advise(event)
             elif isinstance(event, TrialInformation) and self._is_about_newest(event):
                 state.information = event
-        quiet = now - state.heard > QUIET
-        if quiet and not state.renewal.wanted and not self.behind and not self.calibrating \
-                and not self._live_information.alive and now - state.renewal.last > QUIET:
-            self._seek_advice(now)
-        # While messages keep coming, a renewal every two seconds leaves the processor to other programs.
-        if state.renewal.wanted and not self.behind and not self.calibrating and self._collector.count \
-                and not self._live_information.alive \
-                and (quiet or now - state.renewal.last > 2.0):
-            state.renewal = Pace(wanted=not quiet, last=now)
-            place = self._place() if quiet else None
-            state.asked = place
-            self._live_information.start(
-                self._collector.trials, self._graph.options().of_calibration, state.result, quiet,
-                None if place is None else self._asking(place))
-
-    def _seek_advice(self, now: float) -> None:
-        """Seek advice from where the DLO rests now, if that is elsewhere than the last time."""
-        state = self._state
-        state.renewal.last = now
-        place = self._place()
-        if place is None or state.name == 'done' or state.asked is not None and (
-                len(place) == len(state.asked)
-                and np.nanmean(np.linalg.norm(place.points - state.asked.points, axis=1)) < ELSEWHERE):
+        since = now - state.renewal.last
+        if self.behind or self.calibrating or self._live_information.alive or since < QUIET:
             return
-        state.asked = place
+        quiet, count = now - state.heard > QUIET, self._collector.count
+        # While messages keep coming, a renewal every two seconds leaves the processor to other programs.
+        due = state.renewal.wanted and count > 0 and (quiet or since > 2.0)
+        place = self._place(quiet)
+        asked, then = state.asked, None
+        if place is not None and state.name != 'done' and (
+                asked is None or asked[0] != count or not is_near(asked[1], place)):
+            state.asked, then = (count, place), self._asking(place)
+        elif not due:
+            return
+        state.renewal = Pace(wanted=state.renewal.wanted and not quiet, last=now)
         self._live_information.start(self._collector.trials, self._graph.options().of_calibration,
-                                     state.result, then=self._asking(place))
+                                     state.result, quiet, then)
 
     def _asking(self, place: Chain) -> Callable[[Appraised, Options, Callable[[], bool]], NextAction]:
         limits, make = self._graph.options().of_advice, self._make_simulator

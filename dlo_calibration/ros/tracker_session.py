@@ -10,10 +10,12 @@ A thread of its own tracks.  It always takes the newest image; those that come m
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
+import struct
 import threading
 import time
-from typing import Any, Callable, Mapping, Union
+from typing import Any, Callable, Mapping, Sequence, Union
 
 import numpy as np
 
@@ -53,6 +55,8 @@ OUTPUT_TYPES: Mapping[str, str] = {
 PATIENCE = 0.5  # s that closing waits for the thread
 WAIT = 0.1  # s after which the thread looks again whether to end
 SAME = 0.05  # s between an image and its depth, at most
+DEPTHS = 3  # that are kept; the one nearest to an image is its own
+LATE = 0.1  # s by which a depth may come later than its image
 OVERLAYS = 5.0  # pictures with the line, in a second
 OVERLAY_WIDTH = 640  # px
 SETTLED = 1.0  # s without motion after which an action is looked for
@@ -214,6 +218,7 @@ class TrackerSession(NodeSession[TrackerOptions]):
         self.requests = {'start': self._start, 'stop': self._stop}
         self._background: Background[Event] = Background('tracking')
         self._newest: dict[str, bytes] = {}
+        self._depths: deque[bytes] = deque(maxlen=DEPTHS)
         self._came = threading.Condition()
         self._watch: Watch | None = None  # None: resting
         self._lens: Lens | None = None
@@ -235,7 +240,10 @@ class TrackerSession(NodeSession[TrackerOptions]):
             if kind in (IMAGE, COMPRESSED):
                 self._counts['images'] += 1
                 self._counts['dropped'] += kind in self._newest and self._watch is not None
-            self._newest[kind] = octets
+            if kind == DEPTH:
+                self._depths.append(octets)
+            else:
+                self._newest[kind] = octets
             self._came.notify()
 
     def tick(self) -> None:
@@ -258,34 +266,56 @@ class TrackerSession(NodeSession[TrackerOptions]):
 
     def _work(self, should_stop: Callable[[], bool]) -> Event:
         """Track the newest image again and again."""
-        depth: tuple[int, Floats] | None = None
         while not should_stop():
             with self._came:
                 self._came.wait_for(lambda: IMAGE in self._newest or COMPRESSED in self._newest, WAIT)
+                if self._depths and not self._came.wait_for(self._depth_came, LATE):
+                    self._depths.clear()  # no more of them come
                 taken, self._newest = self._newest, {}
+                kept = tuple(self._depths)
             watch = self._watch
             if watch is None:
                 return None
-            for kind in (INFO, DEPTH, IMAGE, COMPRESSED):
+            for kind in (INFO, IMAGE, COMPRESSED):
                 if kind not in taken:
                     continue
                 try:
                     message = self._decoded(kind, taken[kind])
-                    stamp = message.header.stamp.sec * NANOSECONDS + message.header.stamp.nanosec
                     if kind == INFO:
                         self._lens = _lens(message)
-                    elif kind == DEPTH:
-                        depth = stamp, depths(DEPTH, message)
                     else:
-                        of_image = depth[1] if depth and abs(depth[0] - stamp) < SAME * NANOSECONDS else None
-                        self._background.events.put(watch.take(
-                            stamp, image(kind, message), self._lens, of_image))
+                        stamp, depth = _stamp(taken[kind]), None
+                        try:
+                            depth = self._depth_at(stamp, kept)
+                        except InputError as error:
+                            self._background.events.put(error)
+                        self._background.events.put(
+                            watch.take(stamp, image(kind, message), self._lens, depth))
                 except InputError as error:
                     self._background.events.put(error)
                 except Exception as error:  # damaged messages can raise anything
                     self._background.events.put(InputError(kind, repr(error), 'a message that can be used',
                                                            DEFECT))
         return None
+
+    def _depth_came(self) -> bool:
+        """Return whether no depth that is still to come belongs to the newest image."""
+        stamps = [_stamp(self._newest[kind]) for kind in (IMAGE, COMPRESSED) if kind in self._newest]
+        return not stamps or _stamp(self._depths[-1]) >= max(stamps)
+
+    def _depth_at(self, stamp: int, kept: Sequence[bytes]) -> Floats | None:
+        """
+        Return the depths at a time [ns]; None: none was measured then.
+
+        :param kept: the newest messages of depths.
+        """
+        nearest = min(kept, key=lambda octets: abs(_stamp(octets) - stamp), default=None)
+        if nearest is None or abs(_stamp(nearest) - stamp) > SAME * NANOSECONDS:
+            return None
+        if self._lens is None:  # an estimated focal length is off by some percent, and so are distances
+            raise InputError(DEPTH, 'depths without camera_info', 'the calibration of the camera',
+                             'let ~/camera_info be published, or remap it')
+        return depths(DEPTH, self._decoded(DEPTH, nearest))
 
     # Events of the thread
 
@@ -370,6 +400,14 @@ class TrackerSession(NodeSession[TrackerOptions]):
 
     def _send(self, name: str, message: Any) -> None:
         self._graph.publish(name, self._graph.encode(name, message))
+
+
+def _stamp(octets: bytes) -> int:
+    """Return the stamp [ns] of a message that begins with a header, in CDR; 0: it is too short."""
+    if len(octets) < 12:
+        return 0
+    seconds, nanoseconds = struct.unpack_from('<iI' if octets[1] & 1 else '>iI', octets, 4)
+    return int(seconds) * NANOSECONDS + int(nanoseconds)
 
 
 def _lens(info: Any) -> Lens | None:

@@ -79,7 +79,7 @@ class ImageView:
 
 
 def _depths(depth: Floats, pixels: Floats) -> Floats:
-    """Return the depth (n,) [m] at pixels (n, 2): the median of those nearest to the camera around it."""
+    """Return the depth (n,) [m] at pixels (n, 2): the median of those known in 3 x 3 pixels; NaN: none is."""
     height, width = depth.shape
     columns, rows = np.rint(pixels).astype(int).T
     around = np.stack([depth[np.clip(rows + down, 0, height - 1), np.clip(columns + right, 0, width - 1)]

@@ -193,7 +193,7 @@ class CalibrationFolder:
         source, attempts = self._source, Attempts(self.path)
         parts = source.parts or (source,)
         stamps = [record.log_time * 1e-9 for part in parts for record in part.session.inputs]
-        files = [file for part in parts for file in _recorded(part.path)]
+        files = [file for part in parts for file in recorded_files(part.path)]
         write_values(attempts, result, source.options, Passport.new(
             source.options.measured_by, min(stamps, default=0.0), file_digests(files)))
         with attempts.attempt(SESSION):
@@ -205,7 +205,7 @@ class CalibrationFolder:
             copy = REQUEST if source.request is not None else SESSION
             origin = Origin(source.path.name, repeating_command(copy, source.options, source.flags),
                             source.options,
-                            file_digests([*_recorded(source.path),
+                            file_digests([*recorded_files(source.path),
                                           *([self.path / copy] if copy in attempts.written else [])]),
                             [*source.session.warnings, *source.refusals])
             write_report(self.path / REPORT, result, origin, make_simulator, should_stop,
@@ -263,7 +263,7 @@ def write_values(attempts: Attempts, result: CalibrationResult, options: Options
         write_evaluations(attempts.folder / EVALUATIONS, result)
 
 
-def _recorded(path: Path) -> list[Path]:
+def recorded_files(path: Path) -> list[Path]:
     """List the files that hold the messages of a session."""
     if not path.exists():  # several sessions were calibrated together
         return []

@@ -25,6 +25,9 @@ from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.grips import GripEvidence
 from dlo_calibration.observation.plausibility import implausible_trials, repeated_trials
 
+#: Options of which the largest value of several sessions counts.
+LARGEST = ('slow_chain_error', 'slow_hand_error')
+
 
 @dataclass(frozen=True)
 class Selection:
@@ -166,7 +169,8 @@ def read_sources(selections: Sequence[Selection], warn: Callable[[str], None]) -
         _require_same_observation(first, other)
     # As the files of the result hold them, so that these give the same numbers.
     records = trial_records([trial for source in sources for trial in source.trials])
-    options = {**first.options.flat(), 'sessions': ' '.join(str(len(source.trials)) for source in sources)}
+    options = {**first.options.flat(), 'sessions': ' '.join(str(len(source.trials)) for source in sources),
+               **{name: max(source.options.flat()[name] for source in sources) for name in LARGEST}}
     path = first.path.with_name('+'.join(source.path.name for source in sources))
     session = Session(path, records, records, FileOptions(options))
     merged = Source(replace(selections[0], path=path), session, None, Options.of(options), (), None,
@@ -180,7 +184,7 @@ def _require_same_observation(first: Source, other: Source) -> None:
 
     :raises InputError: if they were observed differently.
     """
-    names = [name for name in names_of(OBSERVATION) if name != 'sessions']
+    names = [name for name in names_of(OBSERVATION) if name not in ('sessions', *LARGEST)]
     for name in names:
         before, now = first.options.flat()[name], other.options.flat()[name]
         if before != now:

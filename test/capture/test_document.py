@@ -35,7 +35,8 @@ FULL = {
                    'turn': 0.0},
                   {'photograph': B, 'kind': 'box', 'first': [100, 20], 'second': [150, 90], 'height': 0.1,
                    'turn': -0.5}],
-    'films': [{'id': 'ddddddd4', 'name': 'rope.mp4', 'ruler': 0.1, 'left_out': [1],
+    'films': [{'id': 'ddddddd4', 'name': 'rope.mp4', 'ruler': 0.1, 'trials': [
+                   {'at': 3.5, 'start': 1.0, 'end': None, 'name': 'the end is lifted', 'used': False}],
                'marks': [{'time': 0.5, 'clicks': [[1, 2], [300.5, 4]]}],
                'held': [{'place': 0.2, 'height': 0.05}]}]}
 

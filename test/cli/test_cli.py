@@ -222,8 +222,9 @@ def test_check_says_that_the_same_session_agrees(run, session, tmp_path):
     assert 0 < printed['probability_of_agreement'] <= 1
     assert set(printed['parameters']['flexibility']) >= {'value', 'change', 'lower', 'upper', 'changed'}
     assert printed['mean_error_m'] >= 0
-    words = run('check', tmp_path / 'out' / 'result.xml', session)[1]
+    _, words, warnings = run('check', tmp_path / 'out' / 'result.xml', session)
     assert words.startswith(('Agrees.', 'Cannot tell.'))
+    assert 'one from which the result was found' in warnings
 
 
 def test_validate_on_another_session_uses_the_results_parameters(run, session, tmp_path):

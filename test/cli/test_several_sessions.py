@@ -76,6 +76,17 @@ def test_the_files_of_the_result_give_it_again(fit, sessions, tmp_path):
 
 
 @pytest.mark.long
+def test_a_film_and_a_session_of_a_robot_are_calibrated_together(fit, sessions, tmp_path):
+    film = tmp_path / 'film.mcap'
+    write_records(film, trial_records(read_session(sessions[0]).trials),
+                  {'table_height': 0.0, 'slow_chain_error': 0.0005, 'slow_hand_error': 0.002})
+    for paths in ([film, sessions[1]], [sessions[1], film]):
+        code, _, _ = fit(*paths, '--output', tmp_path / 'both', '--evaluations', 20)
+        assert code == 0
+        options = read_session(tmp_path / 'both' / 'session.mcap').file_options.values
+        assert (options['slow_chain_error'], options['slow_hand_error']) == (0.0005, 0.002)
+
+
 def test_an_interrupted_calibration_of_several_sessions_goes_on(fit, sessions, tmp_path):
     class Dying(ToySimulator):
         count = 0

@@ -50,6 +50,10 @@ def test_undetermined_parameters_keep_their_value_unless_asked():
     assert quarters.sum() == 500
     assert quarters.min() > 90
     assert varied['flexibility'] == pytest.approx(kept['flexibility'])
+    lying = float(np.median(read_chain_file(START).points[:, 2]))
+    radii = [result.space.reported('self_collision', value)[0] for value in varied['self_collision']]
+    assert 0.9 * lying < max(radii) < 1.1 * lying  # the height at which it lies
+    assert np.median(radii) < 0.9 * lying
 
 
 @pytest.mark.parametrize('kind', ['mjcf', 'usd', 'sdf'])
@@ -63,7 +67,6 @@ def test_the_verb_writes_each_draw_and_a_table(tmp_path, kind, capsys):
     assert first != (tmp_path / 'rope_2.xml').read_text()
     assert 'elasticity is not identifiable' in first
     assert 'this draw' in first
-    (tmp_path / 'again').mkdir()
     assert cli.main([*words, '--output', str(tmp_path / 'again' / 'rope.xml')]) == 0
     assert (tmp_path / 'again' / 'rope_1.xml').read_text() == first
 
@@ -82,6 +85,12 @@ def test_mujoco_loads_draws_of_their_own_stiffness(tmp_path):
         mujoco.mj_resetDataKeyframe(model, state, model.key('start').id)
         mujoco.mj_step(model, state, 200)
         assert np.abs(state.qvel).max() < 1
+
+
+def test_how_draws_vary_is_refused_without_draws(tmp_path, capsys):
+    assert cli.main(['export', str(ROPE), '--format', 'mjcf', '--from', str(START), '--undetermined', 'vary',
+                     '--output', str(tmp_path / 'rope.xml')]) == 2
+    assert '--undetermined: no draws; expected --draws N' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(('count', 'seed'), [(0, 1), (-1, 1), (10001, 1), (2, -1)])

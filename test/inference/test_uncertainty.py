@@ -3,7 +3,7 @@
 
 """The uncertainty of calibrated parameters."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -275,6 +275,13 @@ def test_two_parameters_that_only_show_together_are_named_as_a_combination():
     assert combination[0] * combination[1] < 0
 
 
+def test_two_parameters_of_which_nothing_is_known_are_no_combination():
+    covariance = np.array([[0.08, 0.04, 0.0], [0.04, 0.08, 0.0], [0.0, 0.0, 1e-6]])
+    fit = Linearisation(POINT, np.random.default_rng(4).normal(0, 1e-3, ROWS), linear_model())
+    uncertainty = at_minimum(fit, LAYOUT, noise=1e-3)
+    assert replace(uncertainty, covariance=covariance).undetermined == ()
+
+
 def test_a_value_at_the_end_of_the_scale_is_flagged_and_its_interval_ends_there():
     residuals = np.random.default_rng(5).normal(0, 1e-3, ROWS)
     fit = Linearisation(np.array([0.0, 0.6, 1.0]), residuals, linear_model())
@@ -371,6 +378,17 @@ def test_an_interval_contains_what_the_trials_say_without_any_one_of_them():
     without = POINT + jackknife(weighted, LAYOUT.rows, prior_information(len(POINT)))
     assert (uncertainty.lower <= np.clip(without, 0, 1)).all()
     assert (uncertainty.upper >= np.clip(without, 0, 1)).all()
+
+
+def test_trials_that_hardly_tell_a_parameter_do_not_disagree_about_it():
+    generator, jacobian = np.random.default_rng(13), linear_model()
+    others = slice(LAYOUT.rows[0].stop, None)
+    jacobian[others, 0] *= 0.02  # the first trial alone tells the first parameter
+    residuals = generator.normal(0, 1e-3, ROWS)
+    residuals[others] += 1e-3 * jacobian[others, 0] / np.abs(jacobian[others, 0]).max()
+    fit = Linearisation(POINT, residuals, jacobian)
+    agree, disagree = (at_minimum(fit, LAYOUT, noise=noise) for noise in (1e-3, 1e-4))
+    assert disagree.upper[0] - disagree.lower[0] < 1.2 * (agree.upper[0] - agree.lower[0])
 
 
 def test_an_error_of_the_hands_widens_the_intervals_as_far_as_it_moves_the_optimum():

@@ -9,7 +9,7 @@ from filmed_hands import CLOSES, COUNT, filmed_hand, OPENS, RADIUS
 import numpy as np
 import pytest
 
-from dlo_calibration.observation.episodes import episodes
+from dlo_calibration.observation.episodes import Bounds, episodes
 from dlo_calibration.observation.sightings import HandSightings, Sightings
 
 
@@ -176,3 +176,55 @@ def test_a_movement_without_a_hand_says_what_to_do():
 def test_a_dlo_at_rest_makes_no_episode():
     seen, hand, _ = filmed_hand(way=(0.0, 0.0))
     assert episodes(seen, [hand]) == ((), ())
+
+
+@pytest.fixture(scope='module')
+def two_movements():
+    """Give the sightings of two movements of 7 s each, between which the DLO jumps back, and the episodes."""
+    seen, hand = joined(filmed_hand()[:2], filmed_hand(start=7.0, seed=1)[:2])
+    found, _ = episodes(seen, [hand])
+    assert len(found) == 2
+    return seen, hand, found
+
+
+def middle(episode):
+    return (episode.hands[0].start + episode.hands[0].end) / 2
+
+
+def test_bounds_as_they_were_found_change_nothing(two_movements):
+    seen, hand, found = two_movements
+    again, _ = episodes(seen, [hand], None, [Bounds(middle(own), own.start, own.end) for own in found])
+    for own, other in zip(found, again, strict=True):
+        assert np.array_equal(own.initial.points, other.initial.points)
+        assert [time for time, _ in own.goals] == [time for time, _ in other.goals]
+        assert np.array_equal(own.hands[0].positions, other.hands[0].positions)
+
+
+def test_an_episode_begins_and_ends_where_a_person_wants_it(two_movements):
+    seen, hand, (first, second) = two_movements
+    (own, other), _ = episodes(seen, [hand], None, [Bounds(middle(first), 1.0, 4.6)])
+    assert own.start == pytest.approx(1.0, abs=0.05) and own.end == pytest.approx(4.6, abs=0.05)
+    assert max(time for time, _ in own.goals) <= 4.6
+    assert own.places[0] == pytest.approx(first.places[0], abs=0.02)
+    assert (other.start, other.end) == (second.start, second.end)
+
+
+def test_an_episode_ends_before_the_next_movement_begins(two_movements):
+    seen, hand, (first, second) = two_movements
+    (own, _), _ = episodes(seen, [hand], None, [Bounds(middle(first), None, second.end)])
+    assert first.end <= own.end < second.hands[0].start
+
+
+def test_bounds_leave_a_little_of_each_rest(two_movements):
+    seen, hand, (first, second) = two_movements
+    closes, opens = first.hands[0].start, first.hands[0].end
+    (own, _), _ = episodes(seen, [hand], None, [Bounds(middle(first), opens, closes)])
+    assert own.start == pytest.approx(first.latest_start, abs=0.05) and own.start < closes
+    assert own.end == pytest.approx(first.earliest_end, abs=0.05) and own.end > opens
+    assert own.moving == first.moving
+
+
+def test_bounds_of_a_movement_that_is_not_there_are_without_effect(two_movements):
+    seen, hand, found = two_movements
+    again, _ = episodes(seen, [hand], None, [Bounds(6.0, 5.5, 6.5)])
+    assert [(own.start, own.end) for own in again] == [(own.start, own.end) for own in found]

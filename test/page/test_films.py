@@ -44,6 +44,24 @@ def whole(tmp_path_factory):
     return path, film
 
 
+def sees_the_arrow(tab, server):
+    """Let a person see the next movement on the film: from the DLO, as the last trial has left it."""
+    tab.button('Show it on the newest picture').click()
+    head = tab.find('#drawn .head path')
+    head.wait_for()
+    assert tab.find('#drawn .advised').count() == 1
+    advice = server.state()['advice']
+    (begin, *_, end), = advice['ways']
+    box, (u, v) = head.bounding_box(), tab.place(end)
+    assert box['x'] - 6 <= u <= box['x'] + box['width'] + 6
+    assert box['y'] - 6 <= v <= box['y'] + box['height'] + 6
+    line = server.done('GET', f'api/films/{advice["view"]}/line')
+    seen = np.array(list(filter(None, line['pixels'][-1])))
+    # An end may be hidden: then it is one step beyond the last point that is seen.
+    step = np.median(np.linalg.norm(np.diff(seen, axis=0), axis=1))
+    assert np.linalg.norm(seen - begin, axis=1).min() < 1.2 * step
+
+
 def marked(page, identity, time, places):
     """Put clicks into an image of a film, and follow the DLO."""
     def edit(document):
@@ -103,19 +121,39 @@ def test_a_film_becomes_a_trial_that_survives_the_end_of_the_page(tmp_path, whol
         assert recorded.initial.length == pytest.approx(LENGTH, rel=0.02)
         line = page.done('GET', f'api/films/{identity}/line')
         assert len(line['times']) == len(film.times)
-        page.change(lambda document: document['films'][0].update(left_out=[0]))
+
+        def edit(**changes):
+            at = (hand['closes'] + hand['opens']) / 2
+            page.change(lambda document: document['films'][0].update(trials=[{'at': at, **changes}]))
+
+        edit(used=False)
         assert page.state()['trials'] == []
-        page.change(lambda document: document['films'][0].update(left_out=[]))
+        edit(name='towards the wall')
+        assert page.state()['trials'][0]['name'] == 'towards the wall'
+        edit(start=1.0, end=own['end'] - 0.5)
+        state = page.until(lambda state: not state['films'][identity]['cutting'], 'the trial, cut anew')
+        changed, = state['films'][identity]['trials']
+        assert changed['start'] == pytest.approx(1.0, abs=1 / RATE)
+        assert changed['end'] == pytest.approx(own['end'] - 0.5, abs=1 / RATE)
+        assert changed['hands'] == [{**hand, 'place': pytest.approx(hand['place'], abs=0.01)}]
+    with served(tmp_path / 'project') as page:  # where the DLO is was kept
+        state = page.until(lambda state: state['films'][identity].get('trials'), 'the trial')
+        assert state['films'][identity]['trials'] == [changed]
+        assert not state['films'][identity]['outdated']
+        page.change(lambda document: document['films'][0].update(ruler=0.11))
+        assert page.state()['films'][identity]['outdated']
+    kept, = (tmp_path / 'project' / 'films').glob('*.npz')
+    kept.write_bytes(kept.read_bytes()[:1000])
     with served(tmp_path / 'project') as page:  # it is followed again by itself
         state = page.until(lambda state: state['films'][identity].get('trials'), 'the trial')
-        assert state['films'][identity]['trials'] == [own]
+        assert not state['films'][identity]['outdated']
 
 
 @pytest.mark.long
 def test_a_person_drops_a_film_clicks_calibrates_and_sees_the_simulated_dlo_on_it(tmp_path, whole):
     path, film = whole
     with browser() as started, served(tmp_path / 'project', '--evaluations', 40, '--calibrate', 'flexibility',
-                                      'friction', simulator=CompiledSimulator) as server:
+                                      'friction', simulator=CompiledSimulator, appraising=True) as server:
         tab = Tab(started, server.address)
         tab.find('input[type=file][accept*="video"]').set_input_files(str(path))
         tab.button('Follow the DLO').wait_for()
@@ -130,13 +168,39 @@ def test_a_person_drops_a_film_clicks_calibrates_and_sees_the_simulated_dlo_on_i
         tab.find('text=Use this trial').wait_for()
         tab.field('Mass of the DLO').fill('30')
         tab.page.keyboard.press('Tab')
+        tab.find('.advice').get_by_text('Grip').wait_for()
+        assert tab.find('#drawn .head').count() == 0  # the DLO lies elsewhere in the first image
+        sees_the_arrow(tab, server)
         tab.button('Next: Calibrate').click()
         tab.page.get_by_role('button', name='Calibrate', exact=True).last.click()
         tab.find('section[aria-label=Result]').wait_for()
+        sees_the_arrow(tab, server)
+        tab.button('Next: Calibrate').click()
         tab.button('Watch').click()
         tab.field('Time of the film').fill(str(round(film.holds[0][1], 1)))
         tab.find('#drawn .simulated').wait_for()
         assert tab.find('#drawn .sure').count()
+        tab.field('Name').fill('towards the wall')
+        tab.page.keyboard.press('Tab')
+        tab.button('towards the wall').wait_for()
+        edge = tab.page.get_by_role('slider', name='Start of towards the wall')
+        before = float(edge.get_attribute('aria-valuenow'))
+        box = edge.bounding_box()
+        tab.page.mouse.move(box['x'] + box['width'] / 2, box['y'] + box['height'] / 2)
+        tab.page.mouse.down()
+        tab.page.mouse.move(box['x'] + 60, box['y'], steps=4)
+        tab.page.mouse.up()
+        tab.find('text=The trials are cut anew').wait_for()
+        tab.find('text=The trials are cut anew').wait_for(state='detached')
+        start = server.state()['films'][server.state()['document']['films'][0]['id']]['trials'][0]['start']
+        assert start == pytest.approx(float(edge.get_attribute('aria-valuenow')), abs=1 / RATE)
+        assert start > before + 0.2
+        tab.button('Undo').click()
+        tab.page.wait_for_function(
+            '([edge, before]) => Math.abs(edge.getAttribute("aria-valuenow") - before) < 0.01',
+            arg=[edge.element_handle(), before])
+        tab.button('towards the wall').press('Delete')
+        assert not tab.field('Use this trial').is_checked()
         assert not tab.complaints
         tab.close()
 

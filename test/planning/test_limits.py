@@ -184,7 +184,7 @@ def test_crossings_are_those_of_the_signs_of_areas(points):
 DECLARED = {declaration.name: declaration for declaration in PlanOptions.declarations()}
 DEFAULTS = {
     'actions': 4, 'hands': 1, 'kinds': ['grasp_and_place', 'drag'], 'objective': 'points', 'tolerance': 1.0,
-    'crossings': False, 'draws': 8, 'seed': 1, 'height': 0.05, 'speed': 0.1, 'reach_1': '', 'reach_2': '',
+    'crossings': False, 'draws': 8, 'seed': 1, 'height': 0.0, 'speed': 0.0, 'reach_1': '', 'reach_2': '',
     'no_go': [], 'clearance': 0.015, 'least_bend_radius': 0.0, 'most_tension': 0.0, 'workers': 0}
 #: Texts that are options, where not every text is.
 TEXTS = {'reach_1': ['', 'box 0 0 0 1 1 1', 'annulus 0.1 -2 0 1e3'],
@@ -194,6 +194,8 @@ TEXTS = {'reach_1': ['', 'box 0 0 0 1 1 1', 'annulus 0.1 -2 0 1e3'],
 def values(declaration):
     """Return a strategy for the values that an option may have."""
     kind = type(declaration.default)
+    if declaration.name == 'speed':
+        return st.just(0.0) | st.floats(1e-4, declaration.maximum)
     if kind in (int, float):
         return (st.integers if kind is int else st.floats)(declaration.minimum, declaration.maximum)
     if kind is bool:
@@ -203,6 +205,19 @@ def values(declaration):
     if kind is str:
         return st.sampled_from(texts)
     return st.lists(st.sampled_from(texts), min_size=1 if declaration.choices else 0, unique=True)
+
+
+@pytest.mark.parametrize('length, height, speed', [
+    (0.3, 0.05, 0.1), (15.0, 0.05, 0.1), (0.03, 0.005, 0.01)])
+def test_a_dlo_that_is_shorter_than_a_forearm_is_lifted_less_and_moved_more_slowly(length, height, speed):
+    options = PlanOptions().of_length(length)
+    assert (options.height, options.speed) == pytest.approx((height, speed))
+    assert PlanOptions(height=0.2, speed=0.3).of_length(length) == PlanOptions(height=0.2, speed=0.3)
+
+
+def test_hands_that_hardly_move_are_refused():
+    with pytest.raises(InputError, match='parameter speed.*1e-05 m/s.*at least 0.0001 m/s'):
+        PlanOptions(speed=1e-5)
 
 
 def test_the_defaults_of_a_plan_and_the_options_that_no_file_may_set():

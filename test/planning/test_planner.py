@@ -6,7 +6,7 @@
 from dataclasses import replace
 import itertools
 
-from made_up_dlo import HOSE, LENGTH, LEVEL, MadeUpDlo, ROPE, straight
+from made_up_dlo import arc, HOSE, LENGTH, LEVEL, MadeUpDlo, ROPE, straight
 import numpy as np
 import pytest
 from soft_simulator import follow, new_soft, SoftSimulator
@@ -240,12 +240,6 @@ def laid(x, y, z=LEVEL):
     return Chain(np.stack([x, y, z], axis=1))
 
 
-def arc(angle, points=21):
-    """Return a DLO that lies as an arc of a circle."""
-    at = angle * np.linspace(0, 1, points)
-    return laid(np.sin(at) / angle, (1 - np.cos(at)) / angle)
-
-
 def loop():
     """Return a DLO that lies across itself once."""
     at = np.linspace(0, 1, 1000)
@@ -397,6 +391,18 @@ def test_the_sharpest_bend_follows_from_stiffness_and_friction():
     assert f'friction holds only bends with a radius above about {1e3 * LENGTH * radius:.0f} mm' in sentence
 
 
+@pytest.mark.long
+def test_a_plan_of_a_dlo_of_1_cm_ends_within_2_percent_of_the_goal():
+    length, limp = 0.01, {**ROPE, 'flexibility': (99.0, 98.5, 99.5)}
+    start, goal = straight(length=length), arc(0.15, length=length)
+    turned = goal.points @ [[0.92, 0.39, 0.0], [-0.39, 0.92, 0.0], [0.0, 0.0, 1.0]]
+    goal = Chain(turned + [0.3 * length, 0.25 * length, 0.0])
+    made = plan(MadeUpDlo(limp, length=length), start, goal, replace(ONE, seed=3),
+                simulation=Options(nodes=21, time_step=3e-4))
+    assert made.error_before > 0.3 * length
+    assert made.error_after < 0.02 * length
+
+
 def test_a_goal_that_cannot_be_simulated_causes_a_warning():
     dlo = MadeUpDlo()
     rehearse = Rehearser(Pool(ToySimulator(fail_below=101)))
@@ -410,6 +416,13 @@ def test_a_goal_of_another_length_causes_a_warning():
                         'about 7.5 mm away from the goal on average')
     sentence, = warnings_about(Chain(0.95 * arc(1.5).points))
     assert '5.0 % shorter' in sentence
+
+
+def test_two_hands_that_are_wider_than_the_dlo_cause_a_warning():
+    rehearse, dlo = Rehearser(Pool(ToySimulator())), MadeUpDlo(length=0.03)
+    start, goal = straight(length=0.03), arc(0.1, length=0.03)
+    sentence, *_ = goal_warnings(rehearse, Posterior.of(dlo), start, goal, PlanOptions(draws=0, hands=2))
+    assert 'so two of them cannot grip a DLO of 30 mm together' in sentence
 
 
 @pytest.mark.parametrize('options, words', [

@@ -122,7 +122,8 @@ def test_the_launch_file_of_the_tracker_starts_a_calibrator_that_hears_it(monkey
 
 
 def test_the_launch_file_of_a_self_calibration_passes_on_what_is_wanted_and_the_limits(monkeypatch):
-    given = {'wanted': 'flexibility 2, friction 3', 'reach_1': 'annulus 0 0 0.2 0.8', 'height': '0.1'}
+    given = {'wanted': 'flexibility 2, friction 3', 'reach_1': 'annulus 0 0 0.2 0.8', 'height': '0.1',
+             'resume': 'dlo_session_1'}
     started = {entity.options['name']: entity.options['ros_arguments'] for entity in launched(
         'self_calibration', monkeypatch, image='/camera/image_raw', **given)
         if entity.kind == 'Node' and entity.options['name'] != 'rviz2'}

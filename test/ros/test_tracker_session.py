@@ -8,7 +8,7 @@ import time
 
 import cv2
 from filmed_trials import clicks, film_camera, filmed_trials, Move, RADIUS
-from films import Instant, plain_look, Renderer
+from films import depth_image, Instant, plain_look, Renderer
 from laid_board import LaidBoard
 import numpy as np
 from photographs import Camera
@@ -63,6 +63,25 @@ def compressed(image, stamp):
     octets = cv2.imencode('.jpg', image[..., ::-1])[1].tobytes()
     return TYPES.build('sensor_msgs/msg/CompressedImage', header=TYPES.header(stamp, 'camera'), format='jpeg',
                        data=TYPES.octets(octets))
+
+
+def depth(camera, line, stamp, millimetres=True):
+    """Return the message of the depth that is seen of the DLO and the table."""
+    metres = depth_image(camera, line, RADIUS)
+    values = np.rint(1e3 * metres).astype('<u2') if millimetres else metres.astype('<f4')
+    return TYPES.build('sensor_msgs/msg/Image', header=TYPES.header(stamp, 'camera'), height=values.shape[0],
+                       width=values.shape[1], encoding='16UC1' if millimetres else '32FC1', is_bigendian=0,
+                       step=values.itemsize * values.shape[1], data=TYPES.octets(values.tobytes()))
+
+
+def camera_info():
+    """Return the message of the calibration of the camera."""
+    width, height = CAMERA.size
+    region = TYPES.build('sensor_msgs/msg/RegionOfInterest', x_offset=0, y_offset=0, height=0, width=0,
+                         do_rectify=False)
+    return TYPES.build('sensor_msgs/msg/CameraInfo', header=TYPES.header(START, 'camera'), width=width,
+                       height=height, distortion_model='plumb_bob', d=np.zeros(5), k=CAMERA.matrix.ravel(),
+                       r=np.eye(3).ravel(), p=np.zeros(12), binning_x=0, binning_y=0, roi=region)
 
 
 class TrackerGraph(ToyNode):
@@ -177,6 +196,49 @@ def test_images_that_come_faster_than_they_are_tracked_are_dropped(graph):
 def test_points_of_another_form_are_refused(text):
     with pytest.raises(InputError, match='points'):
         TrackerOptions.of({'points': text})
+
+
+@pytest.mark.parametrize('millimetres', [True, False])
+@pytest.mark.parametrize('late', [True, False])
+def test_with_depth_points_in_the_air_have_their_heights(graph, millimetres, late):
+    def lifted(height):
+        line = curve()
+        line[:, 2] += height * np.exp(-((ALONG - 0.5) / 0.3)**2)
+        return line
+
+    node = graph(points=points())
+    node.session.status_period = 0.0
+    node.send([('camera_info', camera_info())])
+    for k, height in enumerate((0.0, 0.005, 0.01, 0.015, 0.02)):
+        stamp = START + k * NANOSECONDS // 15
+        picture = raw(renderer().image([Instant(CAMERA, lifted(height))]), stamp)
+        of_picture = depth(CAMERA, lifted(height), stamp, millimetres)
+        pair = [('image', picture), ('depth', of_picture)]
+        # That of another instant belongs to another image.
+        node.send([('depth', depth(CAMERA, lifted(0.1), stamp - NANOSECONDS // 30, millimetres))])
+        before = node.status['tracked']
+        for kind, message in pair if late else pair[::-1]:
+            node.send([(kind, message)])
+        node.until(lambda before=before: node.status['tracked'] != before)
+    truth = BOARD.seen_from(lifted(0.02))[::5]
+    found = xyz(node.heard['chain'][-1])
+    assert np.isfinite(found[:, 0]).sum() >= 18
+    off = np.abs(found - truth)
+    assert np.nanmax(off[:, 2]) < 0.003 and np.nanmean(np.linalg.norm(off, axis=1)) < 0.003
+
+
+@pytest.mark.parametrize('known, encoding, said', [(True, '8UC1', '16UC1'), (False, '16UC1', 'camera_info')])
+def test_depths_that_cannot_be_used_are_refused_and_the_image_counts(graph, known, encoding, said):
+    node = graph(points=points())
+    node.session.status_period = 0.0
+    if known:
+        node.send([('camera_info', camera_info())])
+    message = depth(CAMERA, curve(), START)
+    message.encoding = encoding
+    node.send([('depth', message)])
+    node.show('image', raw(pixels(), START))
+    node.until(lambda: node.status['tracked'] == '1')
+    assert said in node.status['last_refusal']
 
 
 @pytest.mark.long

@@ -182,6 +182,13 @@ def test_points_that_rest_are_moved_to_the_level_and_others_are_not():
     assert points[0, 2] == pytest.approx(0.004)  # the given ones stay as they were
 
 
+def test_a_raised_part_of_a_dlo_of_1_cm_keeps_its_height():
+    points = arc(height=0.008)
+    points[:11, 2] += np.linspace(0.05, 0.01, 11)
+    points *= 0.01 / Chain(points).length
+    np.testing.assert_array_equal(rest_on(points, points[-1, 2]), points)
+
+
 @pytest.mark.parametrize('diameter', [0.003, 0.008])
 @pytest.mark.parametrize('first_above', [True, False])
 def test_a_strand_that_lies_on_another_keeps_its_height(diameter, first_above):

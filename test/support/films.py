@@ -21,6 +21,7 @@ SUB = 2  # pixels to a pixel of the picture, while lines are painted
 LAYERS = np.array([1.0, 0.93, 0.84, 0.72, 0.58, 0.42, 0.24])  # of the radius: each brighter than the last one
 SHADOW = 2  # pixels of the picture to one of a shadow
 FILTER = 0.4  # standard deviation of a pixel's share of what it shows, in pixels
+SQUARES = np.square(np.arange(256, dtype=np.float32) / 255)  # of what a picture stores: light
 WIDER = 1.4  # px by which OpenCV paints a smooth line of an even thickness wider
 
 
@@ -76,6 +77,7 @@ class Renderer:
         for sheet in look.sheets:
             _lay(table, sheet, places)
         self._table, self._filtered = table, False
+        self._empty = None, None  # a camera, and the light from the empty table in it
         #: from pixels of the table's picture to its places
         self._placed = np.array([[FINENESS, 0, low[0]], [0, -FINENESS, high[1]], [0, 0, 1]])
         azimuth, elevation = look.lamp
@@ -101,9 +103,11 @@ class Renderer:
         seen = camera.matrix @ np.column_stack(
             [camera.rotation[:, :2], -camera.rotation @ camera.position]) @ self._placed
         self._filter(camera)
-        image = cv2.warpPerspective(self._table, seen, camera.size, flags=cv2.INTER_LINEAR,
-                                    borderMode=cv2.BORDER_REPLICATE)
-        image = np.square(image.astype(np.float32) * np.float32(1 / 255))
+        if camera != self._empty[0]:
+            table = cv2.warpPerspective(self._table, seen, camera.size, flags=cv2.INTER_LINEAR,
+                                        borderMode=cv2.BORDER_REPLICATE)
+            self._empty = camera, cv2.LUT(table, SQUARES)
+        image = self._empty[1].copy()
         capsules = capsules_of(instant.curve, self._radius, instant.hands)
         if len(capsules):
             self._shade(image, camera, capsules)
@@ -148,8 +152,16 @@ class Renderer:
                 _lines(mask, ends[0], ends[1], wide, [255] * len(some))
                 metres = np.median((some[:, 2] + some[:, 5]) / 2)
                 blur = max(0.8, 0.3 * metres * np.median(wide / (2 * some[:, 6])))
-                dark = cv2.resize(cv2.GaussianBlur(mask, (0, 0), blur), (width, height)).astype(np.float32)
-                image *= 1 - np.float32(strength / 255) * dark[..., None]
+                left, top, wide, high = cv2.boundingRect(mask)
+                reach = 4 * blur
+                left, right = (int(np.clip(x, 0, size[0])) for x in (left - reach, left + wide + reach + 1))
+                top, bottom = (int(np.clip(y, 0, size[1])) for y in (top - reach, top + high + reach + 1))
+                if right <= left or bottom <= top:
+                    continue
+                dark = cv2.GaussianBlur(mask[top:bottom, left:right], (0, 0), blur)
+                dark = cv2.resize(dark, None, fx=SHADOW, fy=SHADOW).astype(np.float32)
+                part = image[SHADOW * top:SHADOW * bottom, SHADOW * left:SHADOW * right]
+                part *= 1 - np.float32(strength / 255) * dark[..., None]
 
     def _paint(self, image, camera, capsules):
         """Paint a DLO and hands."""
@@ -183,8 +195,7 @@ class Renderer:
                 _lines(coloured, starts[rows], ends[rows], np.maximum(wide[rows] * share, 1), painted)
         small = (right - left, bottom - top)
         share = cv2.resize(cover, small, interpolation=cv2.INTER_AREA).astype(np.float32)[..., None] / 255
-        light = np.square(coloured.astype(np.float32) / 255) * (cover > 0)[..., None]
-        light = cv2.resize(light, small, interpolation=cv2.INTER_AREA)
+        light = cv2.resize(cv2.LUT(coloured, SQUARES), small, interpolation=cv2.INTER_AREA)
         part = image[top:bottom, left:right]
         part *= 1 - share
         part += light
@@ -211,6 +222,22 @@ def _lines(image, starts, ends, wide, colours):
                                    np.maximum(2 * np.rint((wide - WIDER) / 2), 1).astype(int).tolist(),
                                    colours, strict=True):
         cv2.line(image, a, b, colour, width, cv2.LINE_AA, 4)
+
+
+def depth_image(camera, curve, radius):
+    """Return the depth (h, w) along the optical axis [m] of a DLO, (n, 3), and of the table."""
+    width, height = camera.size
+    u, v = np.meshgrid(np.arange(width), np.arange(height))
+    rays = np.stack([u, v, np.ones_like(u)], axis=2) @ np.linalg.inv(camera.matrix).T @ camera.rotation
+    depth = (-camera.position[2] / rays[..., 2]).astype(np.float32)
+    middle = (curve[:-1] + curve[1:]) / 2
+    ahead = (middle - camera.position) @ camera.rotation[2]
+    pixels = np.rint(camera.project(curve) * 16).astype(int)
+    for k in np.argsort(-ahead):  # the farthest first
+        wide = round(2 * radius * camera.focal_length / ahead[k])
+        cv2.line(depth, pixels[k].tolist(), pixels[k + 1].tolist(), float(ahead[k] - radius), max(wide, 1),
+                 cv2.LINE_8, 4)
+    return depth
 
 
 def write_film(path, images, rate=30.0, code='mp4v'):

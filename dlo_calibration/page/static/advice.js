@@ -46,7 +46,7 @@ export function advised(app, shown = null) {
 function show(app, view) {
   const {films, trials} = app.project.document;
   if (films.some((film) => film.id === view)) {
-    app.openFilm(view);
+    app.openFilm(view, true);
     return;
   }
   app.go(app.steps.length - 1);

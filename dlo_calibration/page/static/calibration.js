@@ -115,7 +115,7 @@ export class CalibrationStep {
       h(
         'h3',
         {},
-        `Trial ${k + 1} `,
+        `Trial ${k + 1}${trial.name ? `, ${trial.name}` : ''} `,
         h(
           'span.verdict',
           {class: trial.complete ? 'good' : 'weak'},

@@ -4,6 +4,7 @@
 /** A film: clicks along the DLO, the line that follows it, its trials, and the simulated DLO over it. */
 
 import {advised, arrows} from './advice.js';
+import {timeBlocks} from './blocks.js';
 import {h} from './dom.js';
 import {line} from './line.js';
 import {button, legend, mark, numeric, problem, tick} from './parts.js';
@@ -18,6 +19,7 @@ export class FilmStep {
   #video = null; // the element, or an image where the browser cannot play the film
   #playable = true;
   #lines = new Map(); // film -> {of, line, simulated}
+  #moved = null; // {k, edge, time} while an edge of a trial's block is dragged
 
   constructor(app) {
     this.app = app;
@@ -31,8 +33,8 @@ export class FilmStep {
     return this.app.project.state.films[this.id];
   }
 
-  /** Show a film. */
-  open(id) {
+  /** Show a film, or where its last trial has ended. */
+  open(id, ended = false) {
     if (id !== this.id) {
       this.id = id;
       this.time = 0;
@@ -45,7 +47,23 @@ export class FilmStep {
       this.#video.onpause = () => this.app.refresh();
       this.#video.onplay = () => this.#follow();
     }
+    if (ended) this.#seek(this.#end);
     this.app.refresh();
+  }
+
+  /** @returns {number} when the last trial has ended [s] */
+  get #end() {
+    return this.seen.trials?.at(-1)?.end ?? 0;
+  }
+
+  /** @returns {boolean} whether the DLO is shown as the last trial has left it */
+  get #ended() {
+    return this.time > this.#end - this.#half;
+  }
+
+  /** @returns {number} how far an image may be from a time to be the one of that time [s] */
+  get #half() {
+    return 0.6 / (this.seen.frame_rate ?? 30);
   }
 
   close() {
@@ -112,8 +130,7 @@ export class FilmStep {
 
   /** @returns {number} index of the clicks in the image that is shown; -1: there are none */
   get #mark() {
-    const half = 0.6 / (this.seen.frame_rate ?? 30);
-    return this.entry.marks.findIndex(({time}) => Math.abs(time - this.time) < half);
+    return this.entry.marks.findIndex(({time}) => Math.abs(time - this.time) < this.#half);
   }
 
   panel() {
@@ -132,7 +149,7 @@ export class FilmStep {
         {role: 'status'},
         here < 0
           ? entry.marks.length
-            ? `Clicks are in the ${counted(entry.marks.length, 'image')} at ${entry.marks.map(({time}) => `${time.toFixed(2)} s`).join(', ')}. Where the line is wrong, click along the DLO in the first wrong image: that mends it and what follows.`
+            ? `Clicks are in the ${entry.marks.length > 1 ? 'images' : 'image'} at ${entry.marks.map(({time}) => `${time.toFixed(2)} s`).join(', ')}. Where the line is wrong, click along the DLO in the first wrong image: that mends it and what follows.`
             : 'No clicks yet. Begin at one end of the DLO; the printed board must lie beside it.'
           : `${counted(entry.marks[here].clicks.length, 'click')} in this image.`,
       ),
@@ -148,8 +165,8 @@ export class FilmStep {
         }),
       ),
       progress || seen.waiting ? this.#progress(progress) : null,
-      advised(app, this.id),
-      seen.trials ? this.#outcome(seen, entry) : null,
+      advised(app, this.#ended ? this.id : null),
+      seen.trials ? this.#outcome(seen) : null,
       h(
         'details',
         {key: 'held'},
@@ -231,7 +248,7 @@ export class FilmStep {
     );
   }
 
-  #outcome(seen, entry) {
+  #outcome(seen) {
     const lost = seen.images - seen.tracked;
     return h(
       'section',
@@ -245,11 +262,13 @@ export class FilmStep {
         seen.outdated ? '. The clicks have changed since: follow it again.' : '.',
       ),
       seen.trials.length ? null : h('p.problem', {}, 'No movement of the DLO by a hand was found.'),
+      seen.cutting ? h('p.busy', {role: 'status'}, 'The trials are cut anew …') : null,
       seen.trials.map((trial, k) =>
         h(
           'fieldset.trialcard',
           {key: k},
-          h('legend', {}, `${trial.start.toFixed(1)} to ${trial.end.toFixed(1)} s`),
+          h('legend', {}, this.#title(k)),
+          h('p.note', {}, `${trial.start.toFixed(1)} to ${trial.end.toFixed(1)} s, ${counted(trial.goals, 'chain')}`),
           trial.hands.map((hand) =>
             h(
               'p',
@@ -257,19 +276,24 @@ export class FilmStep {
               `${hand.name.replace('_', ' ')} holds the DLO at ${Math.round(100 * hand.place)} % of its length, from ${hand.closes.toFixed(1)} to ${hand.opens.toFixed(1)} s.`,
             ),
           ),
-          h('p.note', {}, counted(trial.goals, 'chain')),
+          h(
+            'label.field.tall',
+            {},
+            h('span', {}, 'Name'),
+            h('input', {
+              type: 'text',
+              maxlength: 100,
+              value: this.#changes(k).name,
+              onchange: (event) => this.#change(k, {name: event.target.value.trim()}),
+            }),
+          ),
           h(
             'div.row',
             {},
             tick({
               label: 'Use this trial',
-              checked: trial.used,
-              onset: (value) =>
-                this.#edit((film) => {
-                  film.left_out = value
-                    ? film.left_out.filter((other) => other !== k)
-                    : [...film.left_out, k];
-                }),
+              checked: this.#changes(k).used,
+              onset: (used) => this.#change(k, {used}),
             }),
             button('Show', () => this.#seek(trial.start)),
           ),
@@ -292,7 +316,7 @@ export class FilmStep {
     return [
       ...pieces(pixels).map((piece, k) => line(piece, seen.outdated ? 'before' : 'sure', `piece${k}`)),
       simulated ? line(simulated, 'simulated', 'simulated') : null,
-      ...(this.time >= (seen.trials?.at(-1)?.end ?? 0) ? arrows(this.app, this.id) : []),
+      ...(this.#ended ? arrows(this.app, this.id) : []),
       ...(here < 0 ? [] : entry.marks[here].clicks).map((at, k) =>
         mark({
           name: `click ${k}`,
@@ -343,7 +367,7 @@ export class FilmStep {
     const {simulated} = this.#shown();
     return [
       h(
-        'div.controls',
+        'div.controls.film',
         {key: 'film', role: 'group', 'aria-label': 'Film'},
         this.#playable
           ? h(
@@ -369,26 +393,13 @@ export class FilmStep {
             'aria-valuetext': `${this.time.toFixed(2)} seconds`,
             oninput: (event) => this.#seek(Number(event.target.value)),
           }),
-          h(
-            'svg.blocks',
-            {viewBox: `0 0 ${seen.duration} 1`, preserveAspectRatio: 'none', 'aria-hidden': 'true'},
-            (seen.trials ?? []).map((trial, k) =>
-              h('rect', {
-                key: k,
-                class: trial.used ? 'used' : 'unused',
-                x: trial.start,
-                y: 0,
-                width: Math.max(trial.end - trial.start, 0.01),
-                height: 1,
-              }),
-            ),
-          ),
+          seen.trials?.length ? this.#blocks() : null,
         ),
         h('output', {}, `${this.time.toFixed(2)} s`),
-        this.#playable
-          ? null
-          : h('span.note', {}, 'This browser cannot play the film; move the slider to see its images.'),
       ),
+      this.#playable
+        ? null
+        : h('span.note', {}, 'This browser cannot play the film; move the slider to see its images.'),
       legend(
         [
           ['mark click', 'your click'],
@@ -397,6 +408,68 @@ export class FilmStep {
         ].filter(Boolean),
       ),
     ];
+  }
+
+  /** @returns {[number, number]} from when to when hands hold the DLO in a trial [s] */
+  #holds(k) {
+    const {hands} = this.seen.trials[k];
+    return [Math.min(...hands.map(({closes}) => closes)), Math.max(...hands.map(({opens}) => opens))];
+  }
+
+  /** @returns {object} what the person changed about a trial */
+  #changes(k) {
+    const [closes, opens] = this.#holds(k);
+    const known = this.entry.trials.find(({at}) => closes <= at && at <= opens);
+    return known ?? {at: (closes + opens) / 2, start: null, end: null, name: '', used: true};
+  }
+
+  #change(k, change, merge = null) {
+    const changes = this.#changes(k);
+    this.#edit((film) => {
+      film.trials = film.trials.filter(({at}) => at !== changes.at);
+      film.trials.push({...changes, ...change});
+      film.trials.sort((a, b) => a.at - b.at);
+    }, merge);
+  }
+
+  #title(k) {
+    const {name} = this.#changes(k);
+    return name || `Trial ${k + 1}`;
+  }
+
+  #blocks() {
+    const {duration, frame_rate: rate, trials} = this.seen;
+    const moved = this.#moved;
+    const blocks = trials.map((trial, k) => {
+      const changes = this.#changes(k);
+      const at = (edge) => (moved?.k === k && moved.edge === edge ? moved.time : (changes[edge] ?? trial[edge]));
+      return {
+        title: this.#title(k),
+        used: changes.used,
+        start: at('start'),
+        end: at('end'),
+        limits: {
+          start: [trials[k - 1]?.earliest_end ?? 0, trial.latest_start],
+          end: [trial.earliest_end, trials[k + 1]?.latest_start ?? duration],
+        },
+      };
+    });
+    return timeBlocks({
+      duration,
+      step: 1 / (rate ?? 30),
+      blocks,
+      onshow: (k) => this.#seek(blocks[k].start),
+      onuse: (k, used) => this.#change(k, {used}),
+      onmove: (k, edge, time) => {
+        this.#moved = {k, edge, time};
+        this.#seek(time);
+      },
+      onmoved: () => {
+        const {k, edge, time} = this.#moved ?? {};
+        this.#moved = null;
+        if (edge) this.#change(k, {[edge]: time}, `edge ${edge} ${k}`);
+      },
+    });
   }
 
   tap(pixel) {

@@ -73,7 +73,7 @@ class App {
   /** Open the project, at the first step that is not done. */
   async open() {
     await this.project.open();
-    const first = this.steps.findIndex((step) => !step.done());
+    const first = this.steps.findIndex((step, k) => !this.skips(k) && !step.done());
     this.go(first < 0 ? this.steps.length - 1 : first, false);
   }
 
@@ -88,9 +88,9 @@ class App {
   }
 
   /** Show a film, in place of the steps. */
-  openFilm(id) {
+  openFilm(id, ended = false) {
     this.project.clear();
-    this.film.open(id);
+    this.film.open(id, ended);
     this.#fit = true;
     this.view.unsettle();
     this.refresh();

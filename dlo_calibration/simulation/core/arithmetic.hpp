@@ -83,10 +83,14 @@ inline auto max(A a, B b) { return select(b > a, b, a); }
 
 inline double sqrt(double x) { return __builtin_sqrt(x); }
 inline Vector sqrt(Vector x) {
-#ifdef __clang__
+#if defined __clang__
   return __builtin_elementwise_sqrt(x);
+#elif defined DLO_AVX2
+  return __builtin_ia32_sqrtpd256(x);
+#elif defined __SSE2__
+  return __builtin_ia32_sqrtpd(x);
 #else
-  for (int k = 0; k < kWidth; ++k) x[k] = __builtin_sqrt(x[k]);  // one instruction
+  for (int k = 0; k < kWidth; ++k) x[k] = __builtin_sqrt(x[k]);
   return x;
 #endif
 }
