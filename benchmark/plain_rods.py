@@ -85,8 +85,8 @@ def main() -> None:
         print(*rows[-1], result.stop_reason, flush=True)
     text = '\n\n'.join([
         '# Plain rods', f'`python benchmark/plain_rods.py{f" {count}" if count != RODS else ""}`',
-        'Straight and even rods of one strand between two clamps, simulated with 121 nodes and a third of the time '
-        f'step; {TRIALS} trials of {SECONDS:g} s, with a noise of {1e3 * NOISE:g} mm in each coordinate.',
+        'Straight and even rods of one strand between two clamps, simulated with 121 nodes and a third of '
+        f'the time step; {TRIALS} trials of {SECONDS:g} s, noise of {1e3 * NOISE:g} mm in each coordinate.',
         table(['rod', 'flexibility', 'found', 'error, mm', 'parts', 'knots of a rest shape', 'locks'], rows),
         f'**{sum(plain)} of {count} stay plain**: one part, no rest shape, no locking.']) + '\n'
     print(text)

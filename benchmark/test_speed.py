@@ -42,7 +42,7 @@ def tables():
     """Collect the rows, and write the tables when they are complete."""
     speeds, trials, parts, cables, together = [], [], [], [], []
     yield speeds, trials, parts, cables, together
-    wanted = [len(NODES), len(ACTIONS), len(TOGETHER), 5]
+    wanted = [len(NODES), len(ACTIONS), len(TOGETHER), 6]
     if [len(lines) for lines in (parts, trials, together, cables)] != wanted:
         return  # a part was measured alone
     nodes = np.log([row[0] for row in speeds])
@@ -104,7 +104,7 @@ def test_cables(benchmark, tables):
     plain = {**ParameterSpace().physical({}, 1.2), 'flexibility': 2e-3, 'mass': 0.1, 'damping': 1.0,
              'self_collision': 0.003}
     frame = {'torsion': 0.7, **{name: 3.0 * (-1)**k for k, name in enumerate(knot_names(9))}}
-    friction = {'bending_friction': 1.0, 'bending_slip': 0.1}
+    friction, locking = {'bending_friction': 1.0, 'bending_slip': 0.1}, {'locking': 0.1}
     swing = np.sin(np.linspace(0, np.pi, count + 1))[1:, None, None] * np.array(
         [(0, 0.1, 0), (0, 0.1, 0), (-0.2, 0, 0.1), (-0.2, 0, 0.1)])
     turns = np.tile(np.eye(3).reshape(9), (count, 1))
@@ -116,7 +116,8 @@ def test_cables(benchmark, tables):
         core.Event.hold(held), core.Event.advance(grips, count)], 0.001, 100)
     cables = {name: {**plain, **more} for name, more in {
         'plain': {}, 'natural curvature': {'natural_curvature': 2.0}, 'material frame': frame,
-        'friction between strands': friction, 'all of it': {**frame, **friction}}.items()}
+        'friction between strands': friction, 'locking': locking,
+        'all of it': {**frame, **friction, **locking}}.items()}
     seconds = side_by_side(benchmark, {
         name: lambda physical=physical: core.roll_out([(script, start, physical, NO_TABLE)], 0.003)
         for name, physical in cables.items()}, 10 * ROUNDS)

@@ -59,10 +59,10 @@ def refine(setting: Setting, uniform: Fit, budget: int) -> Fit:
     Cross-validation predicts each trial from the others (Stone, Cross-validatory choice, 1974), so that
     what only fits noise is rejected. Nothing is tried if noise alone explains the residuals, in goals and
     at the start, or if the linear model shows that new parameters would explain too little. Each search is
-    least squares and starts at the optimum of the coarser space. All evaluations count in the budget, and `Fit.evaluations` contains
-    those of rejected spaces, too. The search in the chosen space stops early: among many parameters that
-    the trials hardly determine, the last percent of the cost is noise that the fit would learn (Prechelt,
-    Automatic Early Stopping Using Cross Validation, 1998).
+    least squares and starts at the optimum of the coarser space. All evaluations count in the budget, and
+    `Fit.evaluations` contains those of rejected spaces, too. The search in the chosen space stops early:
+    among many parameters that the trials hardly determine, the last percent of the cost is noise that the
+    fit would learn (Prechelt, Automatic Early Stopping Using Cross Validation, 1998).
 
     :param uniform: the fit of the uniform DLO.
     :param budget: largest number of evaluations of all searches, including those of `uniform`.
@@ -100,7 +100,7 @@ class _Ladder:
     Tries ever finer spaces, and keeps the best predictor of left-out trials.
 
     :ivar best: the best fit so far; every fit that is tried has its linear model.
-    :param level: of noise [m], with what it does at the start; if it explains the residuals, no rung is tried.
+    :param level: of noise [m], with what it does at the start; it tries nothing if that explains a fit.
     """
 
     def __init__(self, setting: Setting, best: Fit, budget: int, level: float) -> None:

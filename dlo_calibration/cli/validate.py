@@ -13,7 +13,7 @@ from dlo_calibration.calibration.stages import confirmed
 from dlo_calibration.cli.arguments import add_source, read_result_file, selected
 from dlo_calibration.cli.output import print_message, print_result
 from dlo_calibration.workspace.source import read_source
-from dlo_calibration.workspace.validation import validated
+from dlo_calibration.workspace.validation import validated, with_large_errors
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,5 +28,6 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     file = read_result_file(chosen)
     source = read_source(selected(chosen), print_message, file.file_options).require_trials()
     result = validated(file, source.trials, source.options, make_simulator)
+    result = with_large_errors(result, file, source.options, make_simulator)
     print_result(confirmed(result, source.options, make_simulator), chosen.json, source.trial_warnings)
     return 0

@@ -7,8 +7,11 @@ from __future__ import annotations
 
 from contextlib import closing
 from dataclasses import replace
+import math
 import time
 from typing import Sequence
+
+import numpy as np
 
 from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.calibration.engines import SimulatorFactory
@@ -17,15 +20,19 @@ from dlo_calibration.calibration.result import CalibrationResult, simulated_chai
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.evaluation.evaluation import Evaluator
 from dlo_calibration.files.result import Description
+from dlo_calibration.inference.outlier import SOMETHING_ELSE, SURELY
 from dlo_calibration.model.parameters import BY_NAME, measured, number, ParameterSpace
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.grips import GripEvidence
 from dlo_calibration.observation.material import with_shared_places
 from dlo_calibration.observation.plausibility import implausible_trials
+from dlo_calibration.planning.dlo import Posterior
+from dlo_calibration.simulation.protocol import Rollout, simulate_all, Stop
 
 # Unseen actions of the reference objects have up to 1.7 times the error of the calibration (intervals.md in
 # benchmark/results); a DLO of which points move by less than 0.5 % of the length behaves the same.
 FURTHER, SAME = 5.0, 0.005
+DRAWS = 8  # of the parameters, with which a trial of large error is simulated
 
 
 def validated(file: Description, trials: Sequence[Trial], options: Options,
@@ -79,3 +86,50 @@ def _with_errors(evidence: GripEvidence, file: Description) -> tuple[ParameterSp
         f'{name}: {measured(value, BY_NAME[name].unit)} in this session, '
         f'{measured(physical.get(name, 0.0), BY_NAME[name].unit)} in the result; that of the session is used'
         for name, value in errors.items())
+
+
+def with_large_errors(result: CalibrationResult, file: Description, options: Options,
+                      make_simulator: SimulatorFactory = make_chosen_simulator) -> CalibrationResult:
+    """
+    Return a validation with a warning that names the trials whose errors are larger than usual.
+
+    The usual error is the median over the trials. A trial is sensitive if the usual error explains its own,
+    together with how far the uncertainty of the parameters moves its points, on average.
+
+    :param result: what `validated` returns for `file` and `options`.
+    """
+    errors = np.array([each.mean() for each in result.trial_errors])
+    usual = float(np.median(errors))
+    large = np.flatnonzero(errors > SURELY * usual).tolist()
+    if len(errors) < 3 or not large:
+        return result
+    sensitive: list[str] = []
+    odd: list[str] = []
+    for k, spread in zip(large, _spreads(result, file, options, large, make_simulator), strict=True):
+        explained = errors[k] < SURELY * math.hypot(usual, spread)
+        (sensitive if explained else odd).append(
+            f'{result.trials[k].name} ({measured(errors[k], "m")}, {measured(spread, "m")})')
+    words = [f'{what}: {", ".join(names)}' for what, names in (
+        ('these are sensitive', sensitive), (f'in these, {SOMETHING_ELSE}', odd)) if names]
+    return replace(result, warnings=(*result.warnings, (
+        f'half of the trials miss by at most {measured(usual, "m")}; those that miss by more than '
+        f'{number(SURELY)} times that, with what the uncertainty of the parameters alone moves their points; '
+        f'{"; ".join(words)}')))
+
+
+def _spreads(result: CalibrationResult, file: Description, options: Options, chosen: Sequence[int],
+             make_simulator: SimulatorFactory) -> list[float]:
+    """Return how far the uncertainty of the parameters moves the points of some trials, on average [m]."""
+    drawn = Posterior.of(file).drawn_values(DRAWS, 1)
+    with closing(make_simulator(options)) as simulator:
+        evaluator = Evaluator(result.trials, result.space, simulator)
+        every = [evaluator.jobs(result.space.point(dict(zip(file.space.free, values, strict=True))))
+                 for values in drawn]
+        rollouts = simulate_all(simulator, [jobs[k] for k in chosen for jobs in every], Stop())
+    spreads = []
+    for n, k in enumerate(chosen):
+        chains = [rollout.chains for rollout in rollouts[n * DRAWS:(n + 1) * DRAWS]
+                  if isinstance(rollout, Rollout)]
+        spreads.append(float(np.mean([np.linalg.norm(each - result.chains[k], axis=2).mean()
+                                      for each in chains])) if chains else math.nan)
+    return spreads
