@@ -74,11 +74,13 @@ STRANGE = 16.0  # distance in L, a, b of what is behind an end, from which on it
 APART = 0.6  # half widths between the line and where the image shows it, from which on it is not seen
 LEAST = 0.3  # share of the line that must be seen
 UNEXPLAINED = 0.06  # of the DLO's area: more of its colour elsewhere than usual is too much
+SHOWN = 0.2  # share of the DLO's area that has its colour in the first image, at least
 ADAPTED = 0.05  # share by which what is usual follows each image
 DAMPED = 0.7  # of the velocity that remains
 REDUCED = 4.0  # px, width of the DLO in the picture in which colours are counted
 ALIKE = 0.75  # share of the DLO's usual logarithm of the odds from which on a place there has its colour
 SEARCHES = 10  # images from one search of the whole picture to the next
+ELSEWHERE = 'the DLO is also where the line is not: move it slowly, or start again with new clicks'
 WRONG_LENGTH = 0.05  # share of the length by which a line that is found again may differ
 
 
@@ -158,7 +160,11 @@ class Tracker:
                                            trace.sure) > 0.5, (True, True), 0.0)
         self._velocity: Floats = np.zeros_like(line)
         self._lost_for = 0
-        self._usual = self._unexplained(pixels, line)
+        self._shown = 1.0
+        self._usual, shown = self._unexplained(pixels, line)
+        # Where it is thin or blurred, less than its area has its colour.
+        self._shown = max(shown, SHOWN)
+        self._usual /= self._shown
         return self._tracked()
 
     def next(self, pixels: Pixels, elapsed: float, scale: Scale | None = None) -> Tracked:
@@ -185,6 +191,8 @@ class Tracker:
         if reason:
             self._lost_for += 1
             self._velocity = np.zeros_like(before)
+            if reason == ELSEWHERE:  # from there, it may reach the rest in the next image
+                self._line = found
             return Tracked(np.full((self._count, 2), np.nan), self._width(), reason)
         if self._lost_for or elapsed <= 0:
             self._velocity = np.zeros_like(before)
@@ -397,9 +405,9 @@ class Tracker:
             return 'the DLO has left the picture: show it again'
         if found.seen.mean() < LEAST:
             return 'too little of the DLO is seen: take hands out of the way, and move it slowly'
-        unexplained = self._unexplained(pixels, found.line)
+        unexplained, _ = self._unexplained(pixels, found.line)
         if unexplained > self._usual + UNEXPLAINED:
-            return 'the DLO is also where the line is not: move it slowly, or start again with new clicks'
+            return ELSEWHERE
         # The picture of a camera in the hand shows more or less of other things.
         self._usual += ADAPTED * (unexplained - self._usual)
         return ''
@@ -413,20 +421,22 @@ class Tracker:
         side = max(2, round(0.6 * self._width() / factor))
         return np.asarray(cv2.blur(odds(self._table, lab), (side, side)) > self._alike), factor
 
-    def _unexplained(self, pixels: Pixels, line: Floats) -> float:
-        """Return the area with the DLO's colour that is not at the line, as a share of the DLO's."""
+    def _unexplained(self, pixels: Pixels, line: Floats) -> tuple[float, float]:
+        """Return the areas with the DLO's colour elsewhere and at the line, as shares of the usual one."""
         thick = self._width()
         mask, factor = self._mask(pixels)
         covered = np.zeros(mask.shape, np.uint8)
         points = np.rint(line / factor * 16).astype(np.int32)
         cv2.polylines(covered, [points], False, 1, round(2.5 * thick / factor + 2), cv2.LINE_8, 4)
+        own = float(np.count_nonzero(mask & (covered == 1)))
         elsewhere: Any = (mask & (covered == 0)).astype(np.uint8)
         # What is thicker than the DLO, or not much longer than thick, is another thing, say a hand.
         kernel = np.ones((round(1.7 * thick / factor) + 1,) * 2, np.uint8)
         elsewhere &= 1 - cv2.morphologyEx(elsewhere, cv2.MORPH_OPEN, kernel)
         _, _, parts, _ = cv2.connectedComponentsWithStats(elsewhere)
         areas = parts[1:, cv2.CC_STAT_AREA] * float(factor ** 2)
-        return float(areas[areas > 2.0 * thick ** 2].sum()) / max(thick * float(arc_lengths(line)[-1]), 1.0)
+        usual = self._shown * max(thick * float(arc_lengths(line)[-1]), 1.0)
+        return float(areas[areas > 2.0 * self._shown * thick ** 2].sum()) / usual, own * factor ** 2 / usual
 
     def _searched(self, pixels: Pixels) -> _Line | None:
         """Return the line found anywhere in the picture; None: there is none that is sure."""

@@ -6,6 +6,7 @@
 from dataclasses import replace
 import functools
 
+import cv2
 from films import Instant, plain_look, Renderer
 import numpy as np
 from photographs import Camera, Hand
@@ -194,3 +195,28 @@ def test_a_picture_of_something_else_is_never_called_tracked():
     curves = [bent(0.4)] * 2 + [None] * 12
     found = tracked(curves)
     assert all(one.lost for one in found[2:])
+
+
+@pytest.mark.parametrize('radius, shift, found_again', [(60.0, 40.0, True), (40.0, 70.0, False)])
+def test_a_thin_loop_that_jumps_is_lost_until_all_of_it_is_found(radius, shift, found_again):
+    def thin(shift):
+        turn = np.linspace(2 * np.pi, 0, 200)[1:-1]
+        loop = np.column_stack([240 - radius * np.sin(turn), 200 - radius * (1 - np.cos(turn))])
+        loop[:, 0] += shift * ((200 - loop[:, 1]) / (2 * radius))**3
+        level = np.full(150, 200.0)
+        line = np.concatenate([np.column_stack([np.linspace(60, 240, 150), level]), loop,
+                               np.column_stack([np.linspace(240, 420, 150), level])])
+        pixels = np.full((320, 480, 3), 12, np.uint8)
+        cv2.polylines(pixels, [np.rint(line * 16).astype(np.int32)], False, (170, 90, 100), 3, cv2.LINE_AA, 4)
+        return cv2.GaussianBlur(pixels, (0, 0), 2.0), line
+
+    tracker = Tracker(41)
+    first, line = thin(0.0)
+    tracker.start(first, line[[0, 75, 150, 175, 200, 250, 300, 325, 400, 497]])
+    assert not tracker.next(first, STEP).lost
+    far, _ = thin(shift)
+    found = [tracker.next(far, STEP) for _ in range(8)]
+    # A part that is there to be seen is not called hidden.
+    assert all(one.lost or np.isfinite(one.pixels[1:-1, 0]).sum() > 36 for one in found)
+    assert found[0].lost
+    assert found[-1].lost != found_again
