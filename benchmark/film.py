@@ -7,22 +7,22 @@ Track DLOs in rendered films whose truth is known, and compare.
 A film shows a simulated rope and a hand that moves it, at 1920 x 1080 pixels and 30 images a second, with
 shadows, blur, noise and compression; in two of ten, the camera is held in the hand.
 
-    python benchmark/film.py [--films N] [--folder FOLDER] [--only FILM]
+    python benchmark/film.py [--films NUMBER ...] [--folder FOLDER]
 
 All films take some two hours.  FOLDER keeps them and the figures of each, so that a run goes on where another
-was interrupted; remove from it what shall be made anew.  With --only, one film is made and tracked, and
-nothing is written.
+was interrupted; remove from it what shall be made anew.
 """
 
 import argparse
 from dataclasses import dataclass, replace
+from functools import partial
 import math
 from pathlib import Path
 import subprocess
 import sys
 import tempfile
 import time
-from typing import Any, Iterator, Sequence
+from typing import Any, Iterator, Mapping, Sequence
 
 from figures import kept, machine, table
 import numpy as np
@@ -56,7 +56,7 @@ EXPOSURE, SUBFRAMES = 0.008, 3  # s; instants that are averaged
 COUNT = 21  # points that are compared
 WRONG = 0.008  # m: farther from the DLO than its diameter is wrong
 LIFTED = 0.002  # m above the table, from where on a point is not on it
-DURATIONS = (15.0, 90.0)  # s, of films whose memory is measured
+DURATIONS = (15.0, 45.0)  # s, of films whose memory is measured
 LOOKS = (
     Look(ground='wood', ground_colour=(0.72, 0.55, 0.38), ground_contrast=0.1, colour=(0.10, 0.24, 0.55)),
     Look(colour=(0.75, 0.15, 0.1), lamp=(0.5, 0.7)),
@@ -284,18 +284,19 @@ def resident_mb(process: int) -> float:
     return own + sum(resident_mb(int(child)) for child in children)
 
 
-def text_of(reports: Sequence[dict[str, Any]], memories: Sequence[dict[str, Any]]) -> str:
+def text_of(reports: Mapping[int, dict[str, Any]], memories: Sequence[dict[str, Any]]) -> str:
     """Return the tables."""
     rows = [(number, 'in the hand' if held(number) else 'on a stand', own['images'],
              f'{own["mean_mm"]:.2f}', f'{own["worst_image_mm"]:.1f}', f'{own["worst_point_mm"]:.1f}',
              f'{100 * (1 - len(own["lost"]) / own["images"]):.1f} %', len(own['wrong']),
-             f'{own["images_per_s"]:.1f}') for number, own in enumerate(reports)]
-    total = sum(own['images'] for own in reports)
-    rows.append(('all', '', total, f'{np.mean([own["mean_mm"] for own in reports]):.2f}',
-                 *(f'{max(own[key] for own in reports):.1f}' for key in ('worst_image_mm', 'worst_point_mm')),
-                 f'{100 * (1 - sum(len(own["lost"]) for own in reports) / total):.1f} %',
-                 sum(len(own['wrong']) for own in reports),
-                 f'{np.mean([own["images_per_s"] for own in reports]):.1f}'))
+             f'{own["images_per_s"]:.1f}') for number, own in reports.items()]
+    total = sum(own['images'] for own in reports.values())
+    rows.append(('all', '', total, f'{np.mean([own["mean_mm"] for own in reports.values()]):.2f}',
+                 *(f'{max(own[key] for own in reports.values()):.1f}'
+                   for key in ('worst_image_mm', 'worst_point_mm')),
+                 f'{100 * (1 - sum(len(own["lost"]) for own in reports.values()) / total):.1f} %',
+                 sum(len(own['wrong']) for own in reports.values()),
+                 f'{np.mean([own["images_per_s"] for own in reports.values()]):.1f}'))
     columns = ('film', 'camera', 'images', 'points on the table off by, mm', 'worst image, mm',
                'worst point, mm', 'tracked', 'wrong images, not said', 'images a second')
     return (table(columns, rows) + '\n\n'
@@ -306,21 +307,17 @@ def text_of(reports: Sequence[dict[str, Any]], memories: Sequence[dict[str, Any]
 def main() -> None:
     """Conduct the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.partition('\n\n')[0].strip())
-    parser.add_argument('--films', type=int, default=FILMS)
+    parser.add_argument('--films', type=int, nargs='+', default=range(FILMS), metavar='NUMBER')
     parser.add_argument('--folder', type=Path, help='of films and figures (default: a temporary one)')
-    parser.add_argument('--only', type=int, metavar='FILM')
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         folder = options.folder or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
-        numbers = range(options.films) if options.only is None else (options.only,)
-        reports = []
-        for number in numbers:
-            reports.append(kept(folder / f'film{number}.json', lambda number=number: report(number, folder)))
-            print(number, reports[-1], flush=True)
-        if options.only is not None:
-            return
-        memories = [kept(folder / f'memory{seconds:.0f}.json', lambda s=seconds: memory(folder, s))
+        reports = {}
+        for number in options.films:
+            reports[number] = kept(folder / f'film{number}.json', partial(report, number, folder))
+            print(number, reports[number], flush=True)
+        memories = [kept(folder / f'memory{seconds:.0f}.json', partial(memory, folder, seconds))
                     for seconds in DURATIONS]
     text = text_of(reports, memories)
     print(text)
@@ -328,8 +325,10 @@ def main() -> None:
            f'DLO on the table. A wrong image shows two points or more over {1e3 * WRONG:.0f} mm from any '
            'part of the DLO. Images a second: to decode, to find the board, the tags and the DLO. For the '
            'memory, the first film plays to and fro.')
+    command = ' '.join(['python benchmark/film.py', *(
+        [] if len(options.films) == FILMS else ['--films', *map(str, options.films)])])
     (HERE / 'results' / 'film.md').write_text(
-        f'# film\n\n`python benchmark/film.py`\n\n{how} {machine()}\n\n{text}\n', encoding='utf-8')
+        f'# film\n\n`{command}`\n\n{how} {machine()}\n\n{text}\n', encoding='utf-8')
 
 
 if __name__ == '__main__':
