@@ -18,7 +18,9 @@ from dlo_calibration.model.chain import Chain as Chain
 from dlo_calibration.model.trial import Force as Force
 from dlo_calibration.model.trial import Goal as Goal
 from dlo_calibration.model.trial import Trial as Trial
+from dlo_calibration.planning.options import AdviceOptions as AdviceOptions
 from dlo_calibration.planning.options import PlanOptions as PlanOptions
 from dlo_calibration.planning.planner import plan as plan
 from dlo_calibration.planning.prediction import simulate as simulate
 from dlo_calibration.simulation.bullet import BulletRope as BulletRope
+from dlo_calibration.workspace.next_action import advise as advise

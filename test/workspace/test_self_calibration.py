@@ -10,10 +10,8 @@ import sys
 import numpy as np
 import pytest
 
-from dlo_calibration import Action, calibrate, Chain, Goal, Options, Trial
+from dlo_calibration import Action, AdviceOptions, advise, calibrate, Chain, Goal, Options, Trial
 from dlo_calibration.observation.grips import GripEvidence
-from dlo_calibration.planning.options import AdviceOptions
-from dlo_calibration.workspace import advise
 
 sys.path.append(str(Path(__file__).resolve().parents[2] / 'examples'))
 
