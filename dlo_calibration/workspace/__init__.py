@@ -8,3 +8,9 @@ A calibration under way and its folder; command line, node and capture page are 
 of a calibration until its result is complete, then the files of the result; `validation` tries a result on
 other trials, and `check` tells whether they show the same DLO.  `next_action` advises what hands do next.
 """
+
+from dlo_calibration.workspace.folder import CalibrationFolder
+from dlo_calibration.workspace.source import read_source, Selection, Source
+from dlo_calibration.workspace.worker import Progress, Worker
+
+__all__ = ['CalibrationFolder', 'Progress', 'Selection', 'Source', 'Worker', 'read_source']
