@@ -35,11 +35,8 @@ from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.evaluation.log import EvaluationLog, Memory
 from dlo_calibration.evaluation.pool import Threads
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.observation.noise import noise
 from dlo_calibration.observation.plausibility import implausible_trials, observation_warnings
-from dlo_calibration.search import LeastSquares, Search, SEARCHES
-
-AGAIN = 10  # evaluations for each parameter that must be left for another search
+from dlo_calibration.search import SEARCHES
 
 
 def calibrate(trials: Sequence[Trial], options: Options | None = None, *,
@@ -124,34 +121,8 @@ def searched(setting: Setting, prior: Prior) -> Fit:
     :raises SimulationError: if no evaluation could be simulated.
     """
     options = setting.options
+    search = SEARCHES[options.search](prior.space.dimension, options.seed, prior.hints)
     if not setting.chooses_parts:
-        return _searched(setting, prior, options.evaluations)
-    uniform = _searched(setting, prior, min(options.evaluations, budget(prior.space.dimension)))
+        return fit(setting, prior.space, search, options.evaluations)
+    uniform = fit(setting, prior.space, search, min(options.evaluations, budget(prior.space.dimension)))
     return refine(setting, uniform, options.evaluations)
-
-
-def _searched(setting: Setting, prior: Prior, evaluations: int) -> Fit:
-    """
-    Search, and as long as noise does not explain the residuals, from other start points, too.
-
-    In a narrow, curved valley, as of flexibility and friction, a search may end far from the minimum.
-    The first search that finds nothing better is the last.
-
-    :param evaluations: largest number of one search; all may have those of the options.
-    """
-    options = setting.options
-
-    def search(seed: int) -> Search:
-        return SEARCHES[options.search](prior.space.dimension, seed, prior.hints)
-
-    best = fit(setting, prior.space, search(options.seed), evaluations)
-    level = noise(setting.trials)
-    while options.search == LeastSquares.name and not (best.stopped or best.explained(level)):
-        spent = len(best.evaluations)
-        left = min(evaluations, options.evaluations - spent)
-        if left < AGAIN * prior.space.dimension:
-            break
-        best, better = best.with_search(fit(setting, prior.space, search(options.seed + spent), left, spent))
-        if not better:
-            break
-    return best

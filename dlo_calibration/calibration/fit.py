@@ -13,12 +13,9 @@ from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.evaluation.linearisation import Linearisation
-from dlo_calibration.evaluation.residuals import Huber
 from dlo_calibration.inference.examination import Examination
-from dlo_calibration.inference.uncertainty import noise_alone
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.search import Observation, Search
-from dlo_calibration.search.least_squares import costs_less
 
 
 @dataclass(frozen=True)
@@ -53,20 +50,6 @@ class Fit:
     def stop_reason(self) -> str:
         """Why the calibration ended, in words."""
         return '; '.join(filter(None, ('stopped on request' if self.stopped else self.ended, self.parts)))
-
-    def explained(self, noise: float) -> bool:
-        """Tell whether noise of this level [m] alone explains the residuals."""
-        residuals = self.best.residuals
-        return residuals is not None and noise_alone(
-            Huber.of(residuals).deviation(residuals, self.space.dimension), noise)
-
-    def with_search(self, other: Fit) -> tuple[Fit, bool]:
-        """Return the better fit, with the evaluations of both, and whether it is `other`, a later search."""
-        here, there = self.best.residuals, other.best.residuals
-        better = there is not None and (here is None or costs_less(there, here))
-        chosen = other if better else self
-        return replace(chosen, evaluations=self.evaluations + other.evaluations,
-                       stopped=other.stopped), better
 
 
 def fit(setting: Setting, space: ParameterSpace, search: Search, budget: int, first: int = 0) -> Fit:
