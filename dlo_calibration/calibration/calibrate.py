@@ -29,14 +29,17 @@ from dlo_calibration.calibration.stages import (
     with_missing_parameters,
     with_outlier,
 )
-from dlo_calibration.errors import InputError
+from dlo_calibration.errors import InputError, SimulationError
 from dlo_calibration.evaluation.cluster import ClusterExecutor
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.evaluation.log import EvaluationLog, Memory
 from dlo_calibration.evaluation.pool import Threads
 from dlo_calibration.model.trial import Trial
+from dlo_calibration.observation.noise import noise
 from dlo_calibration.observation.plausibility import implausible_trials, observation_warnings
-from dlo_calibration.search import SEARCHES
+from dlo_calibration.search import LeastSquares, SEARCHES
+
+AGAIN = 10  # evaluations for each parameter that must be left for another search
 
 
 def calibrate(trials: Sequence[Trial], options: Options | None = None, *,
@@ -125,4 +128,29 @@ def searched(setting: Setting, prior: Prior) -> Fit:
     if not setting.chooses_parts:
         return fit(setting, prior.space, search, options.evaluations)
     uniform = fit(setting, prior.space, search, min(options.evaluations, budget(prior.space.dimension)))
-    return refine(setting, uniform, options.evaluations)
+    found = refine(setting, uniform, options.evaluations)
+    return _searched_again(setting, prior, found) if found.space == uniform.space else found
+
+
+def _searched_again(setting: Setting, prior: Prior, best: Fit) -> Fit:
+    """
+    Search from other start points, too, as long as noise does not explain the residuals of an even DLO.
+
+    In a narrow, curved valley, as of flexibility and friction, a search may end far from the minimum.
+    The first search that finds nothing better is the last.
+    """
+    options, space, level = setting.options, prior.space, noise(setting.trials)
+    while not (best.stopped or setting.should_stop() or best.explained(level)):
+        spent = len(best.evaluations)
+        left = min(budget(space.dimension), options.evaluations - spent)
+        if left < AGAIN * space.dimension:
+            break
+        search = LeastSquares(space.dimension, options.seed + spent, prior.hints)
+        try:
+            other = fit(setting, space, search, left, spent)
+        except SimulationError:  # stopped at its first evaluation, or none can be simulated
+            break
+        best, before = best.with_search(other), best
+        if best.best is before.best:
+            break
+    return best

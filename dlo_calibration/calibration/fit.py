@@ -13,9 +13,12 @@ from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.evaluation.linearisation import Linearisation
+from dlo_calibration.evaluation.residuals import Huber
 from dlo_calibration.inference.examination import Examination
+from dlo_calibration.inference.uncertainty import noise_alone
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.search import Observation, Search
+from dlo_calibration.search.least_squares import costs_less
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,19 @@ class Fit:
     def stop_reason(self) -> str:
         """Why the calibration ended, in words."""
         return '; '.join(filter(None, ('stopped on request' if self.stopped else self.ended, self.parts)))
+
+    def explained(self, level: float) -> bool:
+        """Tell whether noise of this level [m] alone explains the residuals."""
+        residuals = self.best.residuals
+        return residuals is not None and noise_alone(
+            Huber.of(residuals).deviation(residuals, self.space.dimension), level)
+
+    def with_search(self, other: Fit) -> Fit:
+        """Return the better one of this fit and a later one of the same space, with all evaluations."""
+        here, there = self.best.residuals, other.best.residuals
+        better = there is not None and (here is None or costs_less(there, here))
+        return replace(other if better else self, evaluations=self.evaluations + other.evaluations,
+                       stopped=other.stopped, parts=self.parts, validated=self.validated)
 
 
 def fit(setting: Setting, space: ParameterSpace, search: Search, budget: int, first: int = 0) -> Fit:

@@ -33,7 +33,6 @@ from dlo_calibration.inference.cross_validation import (
     log_gains,
     predicts_better,
 )
-from dlo_calibration.inference.uncertainty import noise_alone
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import BY_NAME, KNOTS, LOCKING, MOST_PARTS, ParameterSpace
 from dlo_calibration.model.trial import Trial
@@ -69,7 +68,7 @@ def refine(setting: Setting, uniform: Fit, budget: int) -> Fit:
     :returns: `uniform` if nothing was tried.
     """
     space, trials = uniform.space, setting.trials
-    if uniform.stopped or _explained(uniform, noise(trials)):
+    if uniform.stopped or uniform.explained(noise(trials)):
         return uniform
     try:  # the best point may have no model
         model = uniform.model or _linearised(setting, space, uniform.best.point, np.arange(space.dimension))
@@ -77,7 +76,7 @@ def refine(setting: Setting, uniform: Fit, budget: int) -> Fit:
     except CancelledError:
         return uniform
     uniform = replace(uniform, validated=STARTS)
-    if _explained(uniform, level):
+    if uniform.explained(level):
         return uniform
     ladder, words = _Ladder(setting, replace(uniform, model=model), budget, level), []
     if _shows_rest_shape(trials, space):
@@ -127,7 +126,7 @@ class _Ladder:
         """
         why, latest, missed = '', self.best, 0
         for count, finer in rungs:
-            if _explained(self.best, self._level):
+            if self.best.explained(self._level):
                 break
             space, _ = finer(latest.space, latest.best.point)
             if self._budget - self._spent < 2 * space.dimension:
@@ -163,7 +162,7 @@ class _Ladder:
 
         :returns: the outcome in words; empty if it was not tried.
         """
-        if _explained(self.best, self._level):
+        if self.best.explained(self._level):
             return ''
         uniform = self._tried[0]
         if self._budget - self._spent < 2 * (uniform.space.dimension + 1):
@@ -326,10 +325,3 @@ def _effect_of_starts(setting: Setting, fit: Fit) -> float:
     chains = np.stack([residuals for residuals in seen if residuals is not None])
     away = (chains - chains.mean(axis=0)).ravel() * math.sqrt(STARTS / (STARTS - 1))
     return Huber.of(away).deviation(away, 0)
-
-
-def _explained(fit: Fit, level: float) -> bool:
-    """Tell whether noise of this level [m] alone explains the residuals of a fit."""
-    residuals = fit.best.residuals
-    return residuals is not None and noise_alone(
-        Huber.of(residuals).deviation(residuals, fit.space.dimension), level)

@@ -143,10 +143,10 @@ def test_a_rod_whose_errors_have_another_cause_does_not_lock():
 def test_rungs_that_predict_better_but_not_significantly_do_not_end_a_climb(monkeypatch, first, kept):
     logarithms = [np.zeros(4), np.array(first), np.array(first), np.full(4, -1.0)]
     rungs = [SimpleNamespace(space=EVEN, best=SimpleNamespace(point=None), evaluations=(), validated=0,
-                             errors=np.exp(logarithm)) for logarithm in logarithms]
+                             errors=np.exp(logarithm), explained=lambda level: False)
+             for logarithm in logarithms]
     ladder = _Ladder(Setting(tuple(observed(EVEN, TRUTH)), Options(), None), rungs[0], 100, 1e-3)
     coming = iter(rungs[1:])
-    monkeypatch.setattr('dlo_calibration.calibration.refinement._explained', lambda rung, level: False)
     monkeypatch.setattr(ladder, '_fitted', lambda *arguments: next(coming))
     monkeypatch.setattr(ladder, '_fold_errors', lambda rung: rung.errors)
     ladder.climb([(count, lambda space, point: (space, point)) for count in (3, 5, 9)])
