@@ -121,36 +121,38 @@ def searched(setting: Setting, prior: Prior) -> Fit:
     """
     Find the best parameter set with the chosen search, and the number of parts if that is open.
 
+    Least squares searches again while noise does not explain the residuals of an even DLO, until it finds
+    nothing better.
+
     :raises SimulationError: if no evaluation could be simulated.
     """
-    options = setting.options
-    search = SEARCHES[options.search](prior.space.dimension, options.seed, prior.hints)
-    if not setting.chooses_parts:
-        return fit(setting, prior.space, search, options.evaluations)
-    uniform = fit(setting, prior.space, search, min(options.evaluations, budget(prior.space.dimension)))
-    found = refine(setting, uniform, options.evaluations)
-    return _searched_again(setting, prior, found) if found.space == uniform.space else found
+    options, space, refines = setting.options, prior.space, setting.chooses_parts
+    search = SEARCHES[options.search](space.dimension, options.seed, prior.hints)
+    if options.search != LeastSquares.name:
+        return fit(setting, space, search, options.evaluations)
+    most = budget(space.dimension) if refines else options.evaluations
+    best = fit(setting, space, search, min(most, options.evaluations))
+    while True:
+        best = refine(setting, best, options.evaluations) if refines else best
+        other = _other_search(setting, prior, best) if best.space == space else None
+        best, former = best if other is None else best.with_search(other), best
+        if best.best is former.best:
+            return best
 
 
-def _searched_again(setting: Setting, prior: Prior, best: Fit) -> Fit:
+def _other_search(setting: Setting, prior: Prior, best: Fit) -> Fit | None:
     """
-    Search from other start points, too, as long as noise does not explain the residuals of an even DLO.
+    Search from other start points; None: noise explains the residuals, or no search is possible.
 
     In a narrow, curved valley, as of flexibility and friction, a search may end far from the minimum.
-    The first search that finds nothing better is the last.
     """
-    options, space, level = setting.options, prior.space, noise(setting.trials)
-    while not (best.stopped or setting.should_stop() or best.explained(level)):
-        spent = len(best.evaluations)
-        left = min(budget(space.dimension), options.evaluations - spent)
-        if left < AGAIN * space.dimension:
-            break
-        search = LeastSquares(space.dimension, options.seed + spent, prior.hints)
-        try:
-            other = fit(setting, space, search, left, spent)
-        except SimulationError:  # stopped at its first evaluation, or none can be simulated
-            break
-        best, before = best.with_search(other), best
-        if best.best is before.best:
-            break
-    return best
+    options, space, spent = setting.options, prior.space, len(best.evaluations)
+    left = min(budget(space.dimension), options.evaluations - spent)
+    if best.stopped or setting.should_stop() or left < AGAIN * space.dimension or \
+            best.explained(noise(setting.trials)):
+        return None
+    search = LeastSquares(space.dimension, options.seed + spent, prior.hints)
+    try:
+        return fit(setting, space, search, left, spent)
+    except SimulationError:  # stopped at its first evaluation, or none can be simulated
+        return None

@@ -65,7 +65,8 @@ class Fit:
         here, there = self.best.residuals, other.best.residuals
         better = there is not None and (here is None or costs_less(there, here))
         return replace(other if better else self, evaluations=self.evaluations + other.evaluations,
-                       stopped=other.stopped, parts=self.parts, validated=self.validated)
+                       stopped=other.stopped, validated=self.validated)
+
 
 
 def fit(setting: Setting, space: ParameterSpace, search: Search, budget: int, first: int = 0) -> Fit:

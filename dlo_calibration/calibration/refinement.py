@@ -75,7 +75,7 @@ def refine(setting: Setting, uniform: Fit, budget: int) -> Fit:
         level = math.hypot(noise(trials), _effect_of_starts(setting, uniform))
     except CancelledError:
         return uniform
-    uniform = replace(uniform, validated=STARTS)
+    uniform = replace(uniform, validated=uniform.validated + STARTS)
     if uniform.explained(level):
         return uniform
     ladder, words = _Ladder(setting, replace(uniform, model=model), budget, level), []

@@ -22,6 +22,7 @@ MAXIMUM_COORDINATE = 1e8  # m; bytes read in the wrong order give more, and squa
 MOST_POINTS = 1000
 MINIMUM_SPACING = 1e-6  # m; nearer points are the same point
 NEAR = 0.02  # of a segment; a hand that grips nearer to a point than this grips that point
+SHORT = 0.3  # m; distances that are usual for longer DLOs are, for a shorter one, less in proportion
 SAMPLES_PER_SEGMENT = 16  # of the arc length table; its error is below 1e-4 of a segment
 
 
@@ -46,6 +47,11 @@ def check_size(thing: str, what: str, positions: Floats) -> None:
         raise InputError(thing, f'a coordinate of {rows[tuple(bad[0])]:g} m in {what} {bad[0][0]}',
                          f'at most {MAXIMUM_COORDINATE:g} m',
                          'send metres, in a message in the byte order that is_bigendian names')
+
+
+def in_proportion(usual: float, length: float) -> float:
+    """Return what is usual for a DLO; in proportion less if its length [m] is below `SHORT`."""
+    return usual * min(1.0, length / SHORT)
 
 
 def bezier_curve(knots: Floats, values: Floats, at: Floats) -> Floats:

@@ -8,12 +8,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_calibration.model.chain import Chain, Floats
+from dlo_calibration.model.chain import Chain, Floats, in_proportion
 from dlo_calibration.model.trial import Trial
 
 HANGING = 0.04  # m; a DLO whose lowest points are higher above the table hangs
-RESTING_BAND = 0.006, 0.02  # m, and share of the length; points at rest are at most so far above the lowest
-STACKED = 0.0015, 0.005  # likewise; of two strands that cross, one that is higher by this lies on the other
+# Of a DLO that is not short, see `in_proportion`:
+RESTING_BAND = 0.006  # m; points of a resting chain are at most this much above its lowest one
+STACKED = 0.0015  # m; of two strands that cross, one that is higher by this lies on the other
 RISEN = 0.25  # share of its height above the other strand above which a point of the upper strand is raised
 
 
@@ -39,8 +40,7 @@ def lying_level(chain: Chain, table_height: float) -> float | None:
 
 def resting_band(length: float) -> float:
     """Return how far points of a resting DLO of a length [m] are above its lowest one, at most [m]."""
-    most, share = RESTING_BAND
-    return min(most, share * length)
+    return in_proportion(RESTING_BAND, length)
 
 
 def lowest_level(chain: Chain) -> float:
@@ -61,7 +61,7 @@ def rest_on(points: Floats, level: float) -> Floats:
     """
     rested, length = np.array(points), float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
     resting = rested[:, 2] < level + resting_band(length) / 2
-    resting &= ~_stacked(points, level, min(STACKED[0], STACKED[1] * length)) | (rested[:, 2] < level)
+    resting &= ~_stacked(points, level, in_proportion(STACKED, length)) | (rested[:, 2] < level)
     rested[resting, 2] = level
     return rested
 

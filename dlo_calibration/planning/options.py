@@ -11,12 +11,12 @@ from typing import Self
 from dlo_calibration.calibration.options import declared, DeclaredOptions, MACHINE, SEARCH
 from dlo_calibration.errors import InputError
 from dlo_calibration.inference.target import read_targets
+from dlo_calibration.model.chain import in_proportion, SHORT
 from dlo_calibration.planning.limits import HANDS, Limits, REACH
 
 KINDS = ('grasp_and_place', 'drag')  # of actions
 POINTS, SCORE = 'points', 'score'  # objectives
-SHORT = 0.3  # m; a DLO that is shorter is lifted less, and moved more slowly, in proportion
-LIFT, SPEED = 0.05, 0.1  # m, m/s; of a longer one
+LIFT, SPEED = 0.05, 0.1  # m, m/s; of a DLO that is not short
 SLOWEST = 1e-4  # m/s
 
 
@@ -64,8 +64,8 @@ class HandOptions(DeclaredOptions):
 
     def of_length(self, length: float) -> Self:
         """Return the options for a DLO of a length [m]: lift and speed are those of its length if open."""
-        share = min(1.0, length / SHORT)
-        return replace(self, height=self.height or share * LIFT, speed=self.speed or share * SPEED)
+        return replace(self, height=self.height or in_proportion(LIFT, length),
+                       speed=self.speed or in_proportion(SPEED, length))
 
     @property
     def limits(self) -> Limits:

@@ -14,7 +14,7 @@ import numpy as np
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.evaluation.pool import Pool
 from dlo_calibration.model.action import Action, PATHS
-from dlo_calibration.model.chain import Chain, Floats
+from dlo_calibration.model.chain import Chain, Floats, in_proportion
 from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.simulation.loads import Loads
 from dlo_calibration.simulation.motion import FRAME_RATE, MOST_FRAMES, Motion
@@ -23,7 +23,7 @@ from dlo_calibration.simulation.protocol import Rollout, Simulator
 PAUSE = 1.0  # s from the end of an action to the start of the next; the DLO rests then, however long it takes
 CALM = 1.5  # s of the same in a motion, which does not wait for rest: a released DLO nearly rests by then
 REST = 0.01  # s from the end of an action to the goal at rest
-TRAJECTORY_STEP = 0.01, 1 / 30  # m, and share of the length, that a hand moves at most between two chains
+TRAJECTORY_STEP = 0.01  # m that a hand moves at most between two chains; less if the DLO is short
 
 
 @dataclass(frozen=True)
@@ -96,11 +96,10 @@ def rehearsed_trial(start: Chain, steps: Sequence[ActionStep], trajectories: boo
                     loads: bool = False) -> Trial:
     """Return a trial with the actions in turn; its goals are the DLO at rest after each."""
     steps, goals = in_turn(steps), []
-    longest, share = TRAJECTORY_STEP
     for step in steps:
         action = step.action
         if trajectories:
-            times = _instants(action, min(longest, share * start.length))
+            times = _instants(action, in_proportion(TRAJECTORY_STEP, start.length))
             names = (*step.held_by, *(hand.name for hand in action.hands))
             goals += [Goal(start, float(time), stable=False, held_by=names) for time in times]
         goals.append(Goal(start, action.end + REST, held_by=step.held_by))

@@ -17,7 +17,7 @@ from dlo_calibration.inference.missing_parameters import PARTS
 from dlo_calibration.inference.trial_information import uninformative
 from dlo_calibration.inference.uncertainty import IDENTIFIABLE, MODEL_ERROR, NOT_IDENTIFIABLE, WEAK
 from dlo_calibration.model.action import Hand
-from dlo_calibration.model.chain import Chain, Floats, grip_place
+from dlo_calibration.model.chain import Chain, Floats, grip_place, in_proportion, SHORT
 from dlo_calibration.model.parameters import (
     BY_NAME,
     interval,
@@ -314,8 +314,7 @@ def _with_radius(curvature: float) -> str:
         else measured(curvature, '1/m')
 
 
-FLAT = 1e-3, 1 / 300  # m, and share of the length; a hand that rises by less stays on the table
-SHORT = 0.3  # m; places of a shorter DLO are told with more digits
+FLAT = 1e-3  # m; a hand that rises by less stays on the table; less if the DLO is short
 
 
 def plan_sentences(plan: Plan) -> list[str]:
@@ -408,7 +407,7 @@ def _hand(start: Chain, hand: Hand, on_the_table: str, axes: int, after: str = '
     :param corners: whether to name the places where its way turns, seen from above.
     """
     places, rise = start.arc_lengths(), float(hand.positions[:, 2].max() - hand.positions[0, 2])
-    flat = min(FLAT[0], FLAT[1] * float(places[-1]))
+    flat = in_proportion(FLAT, float(places[-1]))
     way = f'lifts {number(100 * rise)} cm, carries' if rise > flat else on_the_table
     grip = grip_place(places, hand.grips[0], hand.offset) / places[-1]
     turns = [place for place in hand.positions[1:-1, :axes] if corners and not np.isclose(

@@ -81,6 +81,14 @@ def tracked(tmp_path):
     graph.session.close()
 
 
+@pytest.fixture
+def asked(tracked):
+    """Give a calibrator that has advised what to do with a DLO that lies still."""
+    tracked.watch(LONG, START)
+    assert tracked.advised(1)
+    return tracked
+
+
 @pytest.mark.long
 def test_advice_comes_for_a_dlo_that_lies_still_and_after_an_action(tracked):
     tracked.watch(LONG, START)
@@ -95,35 +103,30 @@ def test_advice_comes_for_a_dlo_that_lies_still_and_after_an_action(tracked):
     assert tracked.advised(2)
 
 
-def test_a_dlo_that_is_lost_while_it_moves_asks_for_nothing(tracked):
-    tracked.watch(LONG, START)
-    assert tracked.advised(1)
-    tracked.watch(0.5, START, GOAL_POINTS)
-    tracked.lose(2 * LONG)
-    assert tracked.advised(1)
-    tracked.watch(LONG, GOAL_POINTS)
-    assert tracked.advised(2)
+def test_a_dlo_that_is_lost_while_it_moves_asks_for_nothing(asked):
+    asked.watch(0.5, START, GOAL_POINTS)
+    asked.lose(2 * LONG)
+    assert asked.advised(1)
+    asked.watch(LONG, GOAL_POINTS)
+    assert asked.advised(2)
 
 
 @pytest.mark.long
-def test_a_dlo_that_is_laid_elsewhere_asks_anew(tracked):
-    tracked.watch(LONG, START)
-    assert tracked.advised(1)
-    tracked.act()
-    assert tracked.advised(2)
+def test_a_dlo_that_is_laid_elsewhere_asks_anew(asked):
+    asked.act()
+    assert asked.advised(2)
     elsewhere = GOAL_POINTS + (0.1, 0.1, 0.0)
-    tracked.watch(1.0, GOAL_POINTS, elsewhere)
-    tracked.watch(AdviceOptions().pause, elsewhere)
-    assert tracked.advised(2)
-    tracked.watch(LONG, elsewhere)
-    assert tracked.advised(3)
+    asked.watch(1.0, GOAL_POINTS, elsewhere)
+    asked.watch(AdviceOptions().pause, elsewhere)
+    assert asked.advised(2)
+    asked.watch(LONG, elsewhere)
+    assert asked.advised(3)
 
 
 @pytest.mark.long
-def test_a_request_to_stop_says_that_nothing_is_calibrated_and_advice_goes_on(tracked):
-    tracked.watch(LONG, START)
-    done, answer = tracked.session.request('stop')
+def test_a_request_to_stop_says_that_nothing_is_calibrated_and_advice_goes_on(asked):
+    done, answer = asked.session.request('stop')
     assert not done and 'no calibration under way' in answer
-    assert tracked.advised(1)
-    tracked.act()
-    assert tracked.advised(2)
+    assert asked.advised(1)
+    asked.act()
+    assert asked.advised(2)
