@@ -469,6 +469,7 @@ class CalibrationSession(NodeSession[CalibratorOptions]):
     def _begin_anew(self, why: str) -> None:
         """Begin another session because the clock went back."""
         self._order, self._began = StampOrder(self._order), self._clock()
+        self._state.seen, self._state.newest = None, 0
         if self._state.heard == float('-inf'):  # only initial chains came: there is no session to keep
             self.collecting = Collecting(self._graph.options().of_calibration)
             self._graph.warn(why)

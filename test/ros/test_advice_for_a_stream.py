@@ -12,7 +12,7 @@ from toy_messages import SECOND, toy_trials, trial_messages
 from toy_simulator import ToySimulator
 
 from dlo_calibration import Action
-from dlo_calibration.messages.codec import chain_cloud, GOAL
+from dlo_calibration.messages.codec import chain_cloud, GOAL, INITIAL
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.planning.options import AdviceOptions
 from dlo_calibration.ros.session import LAID
@@ -130,3 +130,12 @@ def test_a_request_to_stop_says_that_nothing_is_calibrated_and_advice_goes_on(as
     assert asked.advised(1)
     asked.act()
     assert asked.advised(2)
+
+
+def test_advice_goes_on_when_the_clock_went_back(tracked):
+    for count, (start, points) in enumerate(((1000, START), (10, GOAL_POINTS)), 1):
+        for stamp in (start, start + 1):
+            tracked.now = stamp * SECOND
+            tracked.send([(INITIAL, chain_cloud(TYPES, Chain(points), tracked.now, 'world'))])
+            tracked.lose(3.0)
+        assert tracked.advised(count)
