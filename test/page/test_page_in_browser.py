@@ -342,7 +342,7 @@ def test_which_strand_is_above_is_asked_at_the_crossing(opened, empty):
     tab.keys('Enter')
     tab.button('A (blue)').click()
     seen(lambda: [answer['first_above'] for answer in entry(empty)['crossings']] == [True])
-    assert tab.find('.bubble').count() == 0
+    tab.find('.bubble').wait_for(state='detached')
 
 
 def test_the_dlo_is_traced_and_a_hand_moved_by_keys_alone(opened, prepared):
