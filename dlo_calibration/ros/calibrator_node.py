@@ -28,8 +28,9 @@ from dlo_calibration.errors import InputError
 from dlo_calibration.messages.codec import INPUT_TYPES, OUTPUT_TYPES, WRENCH
 from dlo_calibration.messages.collector import MARGIN
 from dlo_calibration.model.pose import NUMBERS, Pose
+from dlo_calibration.ros.calibrator_options import CalibratorOptions
 from dlo_calibration.ros.graph_node import GraphNode, SLICE
-from dlo_calibration.ros.session import CalibrationSession, CalibratorOptions
+from dlo_calibration.ros.session import CalibrationSession
 
 LIMIT = 64_000_000  # bytes that wait: 100,000 chains of 40 points, and little of the 1 GB of a small robot
 OVERHEAD = 200  # bytes of a waiting message, besides its content

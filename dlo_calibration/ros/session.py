@@ -14,13 +14,11 @@ from collections import Counter, deque
 from dataclasses import dataclass, field
 from pathlib import Path
 import time
-from typing import Any, Callable, Iterator, Mapping
-
-import numpy as np
+from typing import Any, Callable, Mapping
 
 from dlo_calibration.calibration.choice import choose
 from dlo_calibration.calibration.engines import SimulatorFactory
-from dlo_calibration.calibration.options import declared, DeclaredOptions, MACHINE, Options
+from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.passport import Passport
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.errors import InputError, safe_line, SimulationError
@@ -35,7 +33,6 @@ from dlo_calibration.messages.codec import (
     INITIAL,
     INPUT_TYPES,
     InputMessage,
-    Message,
     MessageTypes,
     NANOSECONDS,
     OUTPUT_TYPES,
@@ -47,38 +44,17 @@ from dlo_calibration.messages.collector import KEPT, StampOrder, TrialCollector,
 from dlo_calibration.messages.encoder import action_message
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.planning.options import AdviceOptions
 from dlo_calibration.ros import diagnostics
+from dlo_calibration.ros.advising import Advising
+from dlo_calibration.ros.calibrator_options import CalibratorOptions
+from dlo_calibration.ros.collecting import Collecting
 from dlo_calibration.ros.markers import alike, markers, shown_obstacles
 from dlo_calibration.ros.node_session import NodeInterface, NodeSession, NodeState, refusal_text
 from dlo_calibration.ros.recorder import Recorder
+from dlo_calibration.ros.resting_place import RestingPlace
 from dlo_calibration.workspace.live_information import Appraised, LiveInformation
 from dlo_calibration.workspace.next_action import next_action, NextAction
 from dlo_calibration.workspace.worker import CalibrationWarning, Failure, Progress, Worker
-
-
-@dataclass(frozen=True)
-class CalibratorOptions(Options, AdviceOptions):
-    """Everything that a user of the node can set: options of the calibration, and of the advice."""
-
-    resume: str = declared(
-        '', 'folder of a session that was interrupted, even by a crash: its messages come first, as if they '
-        'were sent again; relative to the working directory; empty: begin without trials', of=MACHINE)
-
-    @property
-    def of_calibration(self) -> Options:
-        """Those of the calibration alone, which sessions record."""
-        return Options.of(_some(self, Options))
-
-    @property
-    def of_advice(self) -> AdviceOptions:
-        """Those of the advice alone."""
-        return AdviceOptions.of(_some(self, AdviceOptions))
-
-
-def _some(options: DeclaredOptions, kind: type[DeclaredOptions]) -> dict[str, Any]:
-    values = options.flat()
-    return {declaration.name: values[declaration.name] for declaration in kind.declarations()}
 
 
 @dataclass
@@ -118,31 +94,6 @@ class Dropped:
 
 
 @dataclass
-class Place:
-    """
-    Where a DLO is seen.
-
-    :param chain: the first one that shows it there.
-    :param told: whether that is an initial chain, so that the DLO rests.
-    :param since: stamp of that one, and `until` of the last one that shows it there [ns].
-    """
-
-    chain: Chain
-    told: bool
-    since: int
-    until: int
-
-
-def is_near(chain: Chain, other: Chain) -> bool:
-    """Tell whether two chains show a DLO at the same place."""
-    if len(chain) != len(other):
-        return False
-    away = np.linalg.norm(chain.observed - other.observed, axis=1)
-    away = away[np.isfinite(away)]
-    return len(away) > 0 and bool(away.mean() < ELSEWHERE)
-
-
-@dataclass
 class SessionState(NodeState):
     """
     What a reset forgets, besides the trials.
@@ -154,12 +105,6 @@ class SessionState(NodeState):
     :param information: what the newest trial adds.
     :param markers: when to send the markers.
     :param renewal: when to renew `information`.
-    :param advice: what to do next; None: unknown yet.
-    :param asked: number of trials, and where the DLO rested, when advice was sought last.
-    :param seen: where the DLO was seen last; None: an action followed.
-    :param newest: stamp of the newest message that says where it is [ns].
-    :param first: time of the first advice [s].
-    :param minutes_left: until what is wanted is reached, at the speed so far; nan: unknown.
     """
 
     name: str = 'collecting'
@@ -171,12 +116,7 @@ class SessionState(NodeState):
     dropped: Dropped = field(default_factory=Dropped)
     markers: Pace = field(default_factory=Pace)
     renewal: Pace = field(default_factory=Pace)
-    advice: NextAction | None = None
-    asked: tuple[int, Chain] | None = None
-    seen: Place | None = None
-    newest: int = 0
-    first: float | None = None
-    minutes_left: float = float('nan')
+    advising: Advising = field(default_factory=Advising)
 
 
 @dataclass
@@ -195,40 +135,6 @@ class CalibrationUnderWay:
 
 
 ANEW = 'collecting the messages so far anew, as options have changed'  # detail of the status
-
-
-class Collecting:
-    """
-    Collects messages with the options in force.
-
-    A stream of minutes has 10,000 messages, which take seconds to collect anew; a node that answers meanwhile
-    does so in steps.  Until the last step, the trials are those of the former options.
-
-    :ivar options: with which `collector` has collected.
-    :ivar left: how many messages have to be collected anew.
-    """
-
-    def __init__(self, options: Options) -> None:
-        self.options, self.collector = options, TrialCollector(options)
-        self.left = 0
-        self._next, self._other = options, self.collector  # once nothing is left
-        self._steps: Iterator[int] = iter(())
-
-    def change(self, options: Options) -> None:
-        """Begin to collect anew with other options, where those of the observation differ."""
-        if options != self._next:
-            self._next = options
-            self._other, self._steps = self.collector.with_options(options)
-            self.step()
-
-    def step(self) -> bool:
-        """Collect the next message anew; return whether none is left."""
-        self.left = next(self._steps, 0)
-        if not self.left:
-            self.options, self.collector = self._next, self._other
-        return not self.left
-
-
 OF_CALIBRATION = ('progress', 'result', 'dlo_description')  # recorded in the session that was calibrated
 PROGRESS_PERIOD = 0.1  # s between two progress messages, as each is recorded
 
@@ -286,8 +192,6 @@ class Outlet:
                                      obstacles=shown_obstacles(scene)))
 
 
-ELSEWHERE = 0.01  # m that the points of a DLO at rest move on average, if it was moved
-LAID = 3.0  # s besides the pause of an action, for which a DLO lies still that no message says to rest
 QUIET = 0.5  # s without action or goal chain, after which the last trial counts as complete
 PATIENCE = 10.0  # s that closing waits for each worker
 UNDER_WAY = 1.0  # s for which messages from before a jump of the clock may still arrive
@@ -369,7 +273,9 @@ class CalibrationSession(NodeSession[CalibratorOptions]):
             self._state.markers.wanted = self._state.renewal.wanted = True
         refusal = refusal if message is None else self._collect(message)
         if message and not refusal:
-            self._take_place(message)
+            chain = message.chain if isinstance(message, ChainMessage) else None
+            pose = self._collector.pose
+            self._state.advising.place.take(message, pose.chain(chain) if pose and chain else chain)
         if refusal:
             self.refuse(refusal)
         elif not self.calibrating and (self._state.name != 'done' or kind != GOAL):  # a tracker goes on
@@ -406,7 +312,7 @@ class CalibrationSession(NodeSession[CalibratorOptions]):
 
     def change_options(self) -> None:
         """Use the options in force from now on; `collect_anew` collects the messages so far with them."""
-        self._state.asked = None  # other limits permit other actions
+        self._state.advising.asked = None  # other limits permit other actions
         self.collecting.change(self._graph.options().of_calibration)
 
     def collect_anew(self) -> None:
@@ -469,7 +375,7 @@ class CalibrationSession(NodeSession[CalibratorOptions]):
     def _begin_anew(self, why: str) -> None:
         """Begin another session because the clock went back."""
         self._order, self._began = StampOrder(self._order), self._clock()
-        self._state.seen, self._state.newest = None, 0
+        self._state.advising.place = RestingPlace()
         if self._state.heard == float('-inf'):  # only initial chains came: there is no session to keep
             self.collecting = Collecting(self._graph.options().of_calibration)
             self._graph.warn(why)
@@ -506,7 +412,7 @@ class CalibrationSession(NodeSession[CalibratorOptions]):
         self._calibration = CalibrationUnderWay(options, progress, state)
         state.started, state.name, state.detail = True, 'calibrating', log.resumed if log else ''
         self._live_information.stop()
-        state.renewal.wanted, state.asked = True, None  # again after the calibration, as this one was stopped
+        state.renewal.wanted, state.advising.asked = True, None  # after the calibration, as it was stopped
         self._worker.start(trials, options, log)
         return ' '.join(filter(None, [
             f'calibrating on {len(trials)} trial(s), at most {progress.evaluations} evaluations.',
@@ -547,7 +453,7 @@ class CalibrationSession(NodeSession[CalibratorOptions]):
         state, count = self._state, self._collector.count
         self._live_information.stop()
         state.name, state.detail, state.information = 'collecting', '', None
-        state.advice = state.asked = None
+        state.advising.advice = state.advising.asked = None
         state.renewal.wanted = True
         self._show()
         which = f'trial {before}' if count < before else 'the incomplete trial'
@@ -605,40 +511,6 @@ class CalibrationSession(NodeSession[CalibratorOptions]):
         state.markers = Pace(wanted=True)  # at the next tick
         self._report()
 
-    def _take_place(self, message: Message) -> None:
-        """Keep where the newest chain shows the DLO, until an action moves it."""
-        state = self._state
-        if message.stamp < state.newest:  # as of an action that a tracker tells when it is over
-            return
-        state.newest = message.stamp
-        if not isinstance(message, ChainMessage):
-            state.seen = None
-            return
-        pose = self._collector.pose
-        chain = message.chain if pose is None else pose.chain(message.chain)
-        if message.kind != INITIAL and state.seen is not None and is_near(state.seen.chain, chain):
-            state.seen.until = message.stamp
-        else:
-            state.seen = Place(chain, message.kind == INITIAL, message.stamp, message.stamp)
-
-    def _place(self, quiet: bool) -> Chain | None:
-        """
-        Return where the DLO rests, as far as is known; None while it moves, or a hand holds it.
-
-        :param quiet: whether no message has come for a while; a stream itself must show that the DLO rests.
-        """
-        seen, collector = self._state.seen, self._collector
-        if seen is None or seen.told:
-            return None if seen is None else seen.chain
-        if collector.count and not collector.incomplete:
-            goal = collector.trials[-1].goals[-1]
-            if goal.held_by:
-                return None
-            if goal.stable and (quiet or goal.count > 1) and is_near(seen.chain, goal.chain):
-                return goal.chain
-        lain = (seen.until - seen.since) / NANOSECONDS
-        return seen.chain if lain > self._graph.options().pause + LAID else None
-
     def _renew_information(self) -> None:
         """
         Take new information; renew it if trials have changed, and seek advice if the DLO rests elsewhere.
@@ -657,16 +529,16 @@ class CalibrationSession(NodeSession[CalibratorOptions]):
         quiet, count = now - state.heard > QUIET, self._collector.count
         # While messages keep coming, a renewal every two seconds leaves the processor to other programs.
         due = state.renewal.wanted and count > 0 and (quiet or since > 2.0)
-        place = self._place(quiet)
-        asked, then = state.asked, None
-        if place is not None and state.name != 'done' and (
-                asked is None or asked[0] != count or not is_near(asked[1], place)):
-            state.asked, then = (count, place), self._asking(place)
+        options, then = self._graph.options(), None
+        last = self._collector.trials[-1].goals[-1] if count and not self._collector.incomplete else None
+        place = state.advising.place.find(last, quiet, options.pause)
+        if place is not None and state.name != 'done' and state.advising.is_due(count, place):
+            state.advising.asked, then = (count, place), self._asking(place)
         elif not due:
             return
         state.renewal = Pace(wanted=state.renewal.wanted and not quiet, last=now)
-        self._live_information.start(self._collector.trials, self._graph.options().of_calibration,
-                                     state.result, quiet, then)
+        self._live_information.start(
+            self._collector.trials, options.of_calibration, state.result, quiet, then)
 
     def _asking(self, place: Chain) -> Callable[[Appraised, Options, Callable[[], bool]], NextAction]:
         limits, make = self._graph.options().of_advice, self._make_simulator
@@ -682,10 +554,7 @@ class CalibrationSession(NodeSession[CalibratorOptions]):
     def _advise(self, advice: NextAction) -> None:
         """Publish advice; where something is wanted and no action is left, calibrate."""
         state, collector = self._state, self._collector
-        state.advice = advice
-        state.first = self._clock() if state.first is None else state.first
-        if collector.count:
-            state.minutes_left = advice.trials * (self._clock() - state.first) / collector.count / 60
+        state.advising.take(advice, collector.count, self._clock())
         pose, stamp = collector.pose, self._graph.stamp() or NANOSECONDS
         self._report()  # whoever gets the action finds its words there
         if advice.action is None:
@@ -702,19 +571,6 @@ class CalibrationSession(NodeSession[CalibratorOptions]):
                 self._graph.info(self._start())
             except InputError as error:
                 self.refuse(str(error))
-
-    @property
-    def _told(self) -> dict[str, Any]:
-        """Return what the status says about advice."""
-        advice = self._state.advice
-        if advice is None:
-            return {}
-        told: dict[str, Any] = {'advice': advice.words, 'trials_left': advice.trials,
-                                'minutes_left': self._state.minutes_left}
-        for name, (now, then, wanted) in advice.distances.items():
-            told.update({f'half_width_{name}': now, f'expected_half_width_{name}': then,
-                         f'wanted_half_width_{name}': wanted})
-        return told
 
     def _is_about_newest(self, information: TrialInformation | None) -> bool:
         """Tell whether information is about the newest trial; which others may follow."""
@@ -734,7 +590,7 @@ class CalibrationSession(NodeSession[CalibratorOptions]):
         content: dict[str, Any] = {
             'state': state.name, 'trials': collector.count, 'last_refusal': state.last_refusal,
             'incomplete': collector.incomplete, 'detail': ANEW if self.collecting.left else state.detail,
-            'dropped': state.dropped.reported.total(), **self._told}
+            'dropped': state.dropped.reported.total(), **state.advising.told}
         about = state.information if self._is_about_newest(state.information) else None
         if self._status_is_due({**content, 'about': about}, 'last_refusal', 'incomplete', 'dropped'):
             self._outlet.send('status', diagnostics.status(self._types, self._graph.stamp(), content, about))

@@ -198,7 +198,8 @@ def test_a_person_drops_a_film_clicks_calibrates_and_sees_the_simulated_dlo_on_i
         tab.page.mouse.move(box['x'] + 60, box['y'], steps=4)
         tab.page.mouse.up()
         state = server.until(lambda state: start_of_trial(state) > before + 0.2, 'the trial, cut anew')
-        assert start_of_trial(state) == pytest.approx(float(edge.get_attribute('aria-valuenow')), abs=1 / RATE)
+        shown = float(edge.get_attribute('aria-valuenow'))
+        assert start_of_trial(state) == pytest.approx(shown, abs=1 / RATE)
         tab.button('Undo').click()
         tab.page.wait_for_function(
             '([edge, before]) => Math.abs(edge.getAttribute("aria-valuenow") - before) < 0.01',

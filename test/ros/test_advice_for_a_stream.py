@@ -15,7 +15,7 @@ from dlo_calibration import Action
 from dlo_calibration.messages.codec import chain_cloud, GOAL, INITIAL
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.planning.options import AdviceOptions
-from dlo_calibration.ros.session import LAID
+from dlo_calibration.ros.resting_place import LAID
 
 pytestmark = pytest.mark.usefixtures('without_drawings', 'without_slices')
 
@@ -139,3 +139,12 @@ def test_advice_goes_on_when_the_clock_went_back(tracked):
             tracked.send([(INITIAL, chain_cloud(TYPES, Chain(points), tracked.now, 'world'))])
             tracked.lose(3.0)
         assert tracked.advised(count)
+
+
+def test_one_stamp_from_the_future_does_not_silence_advice(tracked):
+    now = tracked.now
+    tracked.now += 1000 * SECOND
+    tracked.watch(0.1, START)
+    tracked.now = now
+    tracked.watch(LONG, START)
+    assert tracked.advised(1)

@@ -13,7 +13,8 @@ from dlo_calibration.errors import InputError
 from dlo_calibration.files.session import read_session
 from dlo_calibration.messages.codec import chain_cloud, INITIAL
 from dlo_calibration.model.chain import Chain
-from dlo_calibration.ros.session import CalibratorOptions, QUIET
+from dlo_calibration.ros.calibrator_options import CalibratorOptions
+from dlo_calibration.ros.session import QUIET
 
 pytestmark = pytest.mark.usefixtures('without_drawings', 'without_slices')
 

@@ -10,8 +10,8 @@ import sys
 import pytest
 from ruamel.yaml import YAML
 
+from dlo_calibration.ros.calibrator_options import CalibratorOptions
 from dlo_calibration.ros.parameter_file import NO_TEXTS, NODES, parameter_file
-from dlo_calibration.ros.session import CalibratorOptions
 
 ROOT = Path(__file__).resolve().parents[2]
 FILE = ROOT / 'config' / 'calibrator.yaml'

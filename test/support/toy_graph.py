@@ -10,7 +10,8 @@ from toy_messages import MINUTE
 
 from dlo_calibration.files.record import encode, typestore
 from dlo_calibration.messages.codec import bag_types, INPUT_TYPES, OUTPUT_TYPES
-from dlo_calibration.ros.session import CalibrationSession, CalibratorOptions
+from dlo_calibration.ros.calibrator_options import CalibratorOptions
+from dlo_calibration.ros.session import CalibrationSession
 
 PATIENCE = 60.0  # s
 TYPES = bag_types()
