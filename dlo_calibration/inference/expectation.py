@@ -28,6 +28,7 @@ from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.excitation import excites
 from dlo_calibration.observation.noise import NO_NOISE, with_other_noise
+from dlo_calibration.observation.slow_errors import gripping_beside
 
 STRIDE = 0.1  # largest step of a derivative at a draw: draws cover the rest of a wide distribution
 MOST_TRIALS = 8  # that are foreseen; a target that needs more is out of reach
@@ -38,15 +39,13 @@ FAILURES = 0.5  # share of the draws of an action that may fail
 
 
 def _slipped(trial: Trial) -> Iterator[Trial]:
-    """Yield, for each hand, the trial in which it goes the same way, but grips GRIP_ERROR further inwards."""
+    """Yield, for each hand but clamps, the trial in which it grips GRIP_ERROR further inwards."""
     chain = trial.initial
     places = chain.arc_lengths()
     for action in trial.actions:
-        for hand in action.hands:
+        for hand in (hand for hand in action.hands if len(hand.grips) == 1):
             place = grip_place(places, hand.grips[0], hand.offset)
-            grip, offset = chain.grip(place + (GRIP_ERROR if place < chain.length / 2 else -GRIP_ERROR))
-            away = chain.gripped((grip,), offset)[0] - chain.gripped(hand.grips[:1], hand.offset)[0]
-            other = replace(hand, grips=(grip,), offset=offset, positions=hand.positions + away)
+            other = gripping_beside(hand, chain, GRIP_ERROR if place < chain.length / 2 else -GRIP_ERROR)
             yield replace(trial, actions=tuple(Action(tuple(
                 other if each is hand else each for each in one.hands)) for one in trial.actions))
 

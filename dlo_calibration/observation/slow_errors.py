@@ -17,7 +17,7 @@ from typing import Callable, Sequence
 import numpy as np
 
 from dlo_calibration.model.action import Action, Hand
-from dlo_calibration.model.chain import Floats, grip_place
+from dlo_calibration.model.chain import Chain, Floats, grip_place
 from dlo_calibration.model.trial import Trial
 
 WAVES = 5  # half waves along the DLO, from 0 on, in the error of a chain
@@ -45,7 +45,7 @@ def with_slow_errors(trials: Sequence[Trial], chain_error: float, hand_error: fl
             changes += [partial(_drifted, late=late, error=DRIFT * hand_error * axis)
                         for late in (False, True)]
     if hand_error:
-        changes.append(partial(_gripping_beside, way=hand_error))
+        changes.append(partial(_all_beside, way=hand_error))
     return [tuple(map(change, trials)) for change in changes]
 
 
@@ -65,7 +65,15 @@ def _drifted(trial: Trial, late: bool, error: Floats) -> Trial:
     return _with_hands(trial, drifted)
 
 
-def _gripping_beside(trial: Trial, way: float) -> Trial:
+def gripping_beside(hand: Hand, chain: Chain, way: float) -> Hand:
+    """Return a hand that grips a chain some way [m] farther along it, and otherwise does the same."""
+    point, offset = chain.grip(grip_place(chain.arc_lengths(), hand.grips[0], hand.offset) + way)
+    moved = chain.gripped((point,), offset) - chain.gripped(hand.grips[:1], hand.offset)
+    return replace(hand, grips=(point,), offset=offset,
+                   positions=hand.positions + hand.poses(hand.times)[1] @ moved[0])
+
+
+def _all_beside(trial: Trial, way: float) -> Trial:
     """Return a trial whose hands grip some way [m] farther along the DLO; clamps grip where they did."""
     chain, places = trial.initial, trial.initial.arc_lengths()
 
@@ -73,11 +81,7 @@ def _gripping_beside(trial: Trial, way: float) -> Trial:
         if len(hand.grips) > 1:
             return hand
         place = grip_place(places, hand.grips[0], hand.offset)
-        place += way if place + way <= places[-1] else -way
-        point, offset = chain.grip(place)
-        moved = chain.gripped((point,), offset) - chain.gripped(hand.grips, hand.offset)
-        return replace(hand, grips=(point,), offset=offset,
-                       positions=hand.positions + hand.poses(hand.times)[1] @ moved[0])
+        return gripping_beside(hand, chain, way if place + way <= places[-1] else -way)
     return _with_hands(trial, beside)
 
 
