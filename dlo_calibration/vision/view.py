@@ -79,21 +79,21 @@ class BoardFinder:
         if self._grey is not None and len(corners):
             corners, kept = self._followed(self._grey, grey)
             near = kept & (np.linalg.norm(corners - self._shown, axis=1) < STILL)
-            if self._scale is not None and near.sum() >= max(FEWEST_CORNERS, len(near) / 4):
-                corners, kept = self._shown, near
-        self._grey = grey
-        if corners is not self._shown or not len(corners):
-            if len(corners):
-                corners, kept = self._on_board(grey, corners, kept)
-            if 2 * kept.sum() < (COLUMNS - 1) * (ROWS - 1) and (not kept.any() or self._since >= AGAIN):
-                corners, kept = self._found(pixels, corners, kept)
-            scale = self._posed(corners, kept)
-            if self._scale is not None and not self._moves and (scale is None or self._still(corners, kept)):
-                # The camera stands; something hides the board, or hid it.
-                self._corners = self._shown
+            if not self._moves and self._scale is not None and near.sum() >= max(
+                    FEWEST_CORNERS, len(near) / 4):
                 return self._scale
-            self._moves = self._moves or self._scale is not None and scale is not None
-            self._scale, self._shown = scale, corners
+        if len(corners):
+            corners, kept = self._on_board(grey, corners, kept)
+        if 2 * kept.sum() < (COLUMNS - 1) * (ROWS - 1) and (not kept.any() or self._since >= AGAIN):
+            corners, kept = self._found(pixels, corners, kept)
+        scale = self._posed(corners, kept)
+        if self._scale is not None and not self._moves and (scale is None or self._still(corners, kept)):
+            # The camera stands; something hides the board, or hid it.
+            self._corners = self._shown
+            return self._scale
+        self._moves = self._moves or self._scale is not None and scale is not None
+        # The corners are followed from this image on: from image to image, a slow motion would be none.
+        self._scale, self._shown, self._grey = scale, corners, grey
         self._corners = corners if kept.any() else corners[:0]
         return self._scale
 

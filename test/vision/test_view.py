@@ -69,5 +69,13 @@ def test_a_camera_in_the_hand_is_followed_or_its_view_is_unknown():
     assert all(known[16:])
 
 
+def test_a_camera_in_the_hand_that_hardly_moves_is_followed():
+    finder = BoardFinder(LENS)
+    places = np.concatenate([0.003 * np.arange(3), 0.006 + 0.00015 * np.arange(1, 13)])  # 0.15 px an image
+    for k, place in enumerate(places):
+        camera = replace(CAMERA, target=(0.1 + place, 0.1))
+        assert error(finder.next(seen(camera)), camera) < 0.001, k
+
+
 def test_one_view_of_the_board_gives_the_focal_length():
     assert first_lens(seen()).matrix[0, 0] == pytest.approx(800.0, rel=0.02)
