@@ -26,7 +26,6 @@ from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.grips import GripEvidence
 from dlo_calibration.observation.material import with_shared_places
 from dlo_calibration.observation.plausibility import implausible_trials
-from dlo_calibration.planning.dlo import Posterior
 from dlo_calibration.simulation.protocol import Rollout, simulate_all, Stop
 
 # Unseen actions of the reference objects have up to 1.7 times the error of the calibration (intervals.md in
@@ -120,6 +119,8 @@ def with_large_errors(result: CalibrationResult, file: Description, options: Opt
 def _spreads(result: CalibrationResult, file: Description, options: Options, chosen: Sequence[int],
              make_simulator: SimulatorFactory) -> list[float]:
     """Return how far the uncertainty of the parameters moves the points of some trials, on average [m]."""
+    from dlo_calibration.planning.dlo import Posterior  # loads slowly, and is rarely needed
+
     drawn = Posterior.of(file).drawn_values(DRAWS, 1)
     with closing(make_simulator(options)) as simulator:
         evaluator = Evaluator(result.trials, result.space, simulator)
