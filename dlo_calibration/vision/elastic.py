@@ -29,6 +29,7 @@ class Evidence:
     :param lengths: (n - 1,) of the segments [px].
     :param stretch: weight of a segment's length.
     :param bend: weight of the second differences of `expected`.
+    :param kept: (n - 2,) share of those second differences that remains; below 1, the line becomes straight.
     :param ends: (2, 2) where both ends are seen [px].
     :param end_weights: (2,).
     """
@@ -41,6 +42,7 @@ class Evidence:
     lengths: Floats
     stretch: float
     bend: float
+    kept: Floats
     ends: Floats
     end_weights: Floats
 
@@ -48,7 +50,7 @@ class Evidence:
 def fitted(start: Floats, known: Evidence) -> Floats:
     """Return the line (n, 2) [px] that fits the evidence best, by Gauss and Newton from a line nearby."""
     line = start
-    bends = known.expected[:-2] - 2 * known.expected[1:-1] + known.expected[2:]
+    bends = known.kept[:, None] * (known.expected[:-2] - 2 * known.expected[1:-1] + known.expected[2:])
     for _ in range(ITERATIONS):
         normal = _Normal(len(line))
         tangents = directions(line)
@@ -64,9 +66,9 @@ def fitted(start: Floats, known: Evidence) -> Floats:
             stencil = np.array([1.0, -2.0, 1.0])[None, :, None] * axis
             normal.add(np.broadcast_to(stencil, (len(bends), 3, 2)), bends @ axis,
                        np.full(len(bends), known.bend))
-        normal.add(tangents[:1, None], _along(tangents[:1], known.ends[:1]), known.end_weights[:1])
-        normal.add(tangents[-1:, None], _along(tangents[-1:], known.ends[1:]), known.end_weights[1:],
-                   len(line) - 1)
+        for axis in np.eye(2):
+            for k, first in enumerate((0, len(line) - 1)):
+                normal.add(axis[None, None], known.ends[k:k + 1] @ axis, known.end_weights[k:k + 1], first)
         line = normal.solution()
     return line
 

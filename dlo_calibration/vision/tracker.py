@@ -54,11 +54,13 @@ WIDER = 16.0  # the same of the first one, after the DLO was lost
 STEPS = (0.25, 0.2, 0.08)  # half widths between the offsets of each of them
 DRIFT = 0.15
 SIGMA = (0.5, 0.3, 0.1)  # half widths: standard deviation of the places that each of them gives
-STRETCH = 0.05  # of a segment's length: standard deviation; a part in the air looks longer
+STRETCH = 0.02  # of a segment's length: standard deviation; a part in the air looks longer
+UNSCALED_STRETCH = 0.05  # the same in a picture without a scale
 BEND = 0.01  # half widths, standard deviation of a change of second differences from image to image
+KEPT = 0.9  # share of the bends that the line keeps from image to image where the DLO is not seen
 FREE = (10.0, 1.5)  # half widths, deviation from where the line is expected: if an end is seen, or none
 STILL = 0.02  # the same along a part that does not move, while another part is in the air
-END = 0.15  # half widths, standard deviation of an end
+END = 0.1  # half widths, standard deviation of an end
 MOVES = 0.12  # half widths from image to image, from which on a part moves
 TOLERANCE = 0.006  # share of the length on a table that a line between two visible ends may lack
 UNSCALED = 0.04  # the same in a picture without a scale
@@ -71,6 +73,7 @@ OTHERS = 5e-4  # share of each colour, e.g. of 2000 colours of hands: a rare col
 SEEN = 0.35  # mean logarithm of the odds of a colour from which on the DLO is seen
 SIDES = np.array([-2.6, -2.2, -1.8, 1.8, 2.2, 2.6])  # half widths beside the DLO, where the ground is seen
 STRANGE = 16.0  # distance in L, a, b of what is behind an end, from which on it is probably covered
+HELD = 4.0  # difference between both ends in that, from which on a hand seems to hold one of them
 APART = 0.6  # half widths between the line and where the image shows it, from which on it is not seen
 LEAST = 0.3  # share of the line that must be seen
 UNEXPLAINED = 0.06  # of the DLO's area: more of its colour elsewhere than usual is too much
@@ -356,10 +359,12 @@ class Tracker:
         """Return the elastic line, which of the ends it has, and the excess of its length."""
         count = len(line)
         lengths = self._length / (count - 1) * fineness
+        stretch = UNSCALED_STRETCH if self._scale is None else STRETCH
         known = Evidence(
             measured, across, expected, np.full(count, 1.0 / (FREE[0] * half) ** 2),
-            0.2 / (FREE[0] * half) ** 2, lengths, 1.0 / (STRETCH * float(lengths.mean())) ** 2,
-            1.0 / (BEND * half) ** 2, np.zeros((2, 2)), np.zeros(2))
+            0.2 / (FREE[0] * half) ** 2, lengths, 1.0 / (stretch * float(lengths.mean())) ** 2,
+            1.0 / (BEND * half) ** 2, np.where(self._line.seen[1:-1], 1.0, KEPT),
+            np.zeros((2, 2)), np.zeros(2))
         tolerance = UNSCALED if self._scale is None else TOLERANCE
         tolerance += BLURRED / float(arc_lengths(line)[-1])
         accepted = [end is not None for end in ends]
@@ -377,12 +382,14 @@ class Tracker:
             if not all(accepted):
                 return fit, (accepted[0], accepted[1]), 0.0
             excess = float((np.linalg.norm(np.diff(fit, axis=0), axis=1) / fineness).sum() / self._length - 1)
-            if excess >= -tolerance:
+            # Behind an end that a hand holds is something else than beside it, and it may be in the air.
+            held = abs(strange[0] - strange[1]) > HELD
+            if (abs(excess) <= tolerance / 4) if held else (excess >= -tolerance):
                 break
             # What covers an end makes the DLO look shorter, and so does an end that is held in the air; both
             # move.
             moved = np.linalg.norm(places - self._line.line[[0, -1]], axis=1).tolist()
-            if abs(strange[0] - strange[1]) > STRANGE / 2:
+            if held:
                 moved = strange
             accepted[int(np.argmax(moved))] = False
         if excess > tolerance:

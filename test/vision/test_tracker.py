@@ -149,6 +149,19 @@ def test_a_dlo_that_leaves_the_picture_and_comes_back():
     assert np.nanmax(errors(found[-1], curves[-1])) < FAR
 
 
+def test_a_line_that_has_come_off_the_end_finds_back():
+    curve = bent(0.4)
+    pixels, scale = renderer().image([Instant(CAMERA, curve)]), scale_of(CAMERA)
+    tracker = Tracker(COUNT)
+    tracker.start(pixels, CAMERA.project(points_of(curve)[::5]), scale)
+    line = np.array(tracker._line.line)
+    line[-9:] = line[-9] + (line[-9:] - line[-9]) @ np.array([[-0.5, 0.8], [-0.8, -0.5]])  # folded back
+    tracker._line = replace(tracker._line, line=line)
+    found = [tracker.next(pixels, STEP, scale) for _ in range(12)]
+    assert np.nanmax(errors(found[-1], curve)) < FAR
+    assert np.isfinite(found[-1].pixels[1:-1]).all()
+
+
 @pytest.mark.long
 def test_blur_is_no_obstacle():
     curves = moving(8)
