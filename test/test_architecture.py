@@ -149,8 +149,7 @@ def test_a_search_never_sees_a_trial():
 
 
 #: What loads slowly; then commands of a process, and what of this they need.
-SLOW = {'dlo_calibration.planning', 'jinja2', 'matplotlib', 'pybullet', 'rclpy',
-        'rosbags.typesys.stores.ros2_jazzy', 'scipy'}
+SLOW = {'dlo_calibration.planning', 'jinja2', 'matplotlib', 'pybullet', 'rclpy', 'scipy'}
 LOADED = (
     ((['info', 'msg_samples/object1'], ['info', 'msg_samples/xml/named_actions.xml'], ['--help']), set()),
     pytest.param((['plot', 'msg_samples/xml/push_and_release.xml'],), {'matplotlib'}, marks=pytest.mark.long),

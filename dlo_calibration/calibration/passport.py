@@ -9,6 +9,7 @@ from contextlib import closing
 from dataclasses import dataclass, field
 import datetime
 import functools
+from importlib.metadata import PackageNotFoundError, version
 import math
 from types import MappingProxyType
 from typing import Mapping
@@ -91,8 +92,6 @@ def _day(stamp: float) -> str:
 
 def package_version() -> str:
     """Return the version of this package."""
-    from importlib.metadata import PackageNotFoundError, version  # loads slowly
-
     try:
         return version('dlo_calibration')
     except PackageNotFoundError:

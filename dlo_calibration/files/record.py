@@ -9,53 +9,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
-from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+from rosbags.typesys import get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
 from dlo_calibration.errors import InputError
-
-#: The messages of the input topics, as Jazzy defines them: all of Jazzy's take a tenth of a second to load.
-DEFINITIONS = {
-    'std_msgs/msg/Header': 'builtin_interfaces/Time stamp\nstring frame_id',
-    'geometry_msgs/msg/Vector3': 'float64 x\nfloat64 y\nfloat64 z',
-    'geometry_msgs/msg/Quaternion': 'float64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1',
-    'geometry_msgs/msg/Transform': 'geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation',
-    'geometry_msgs/msg/Twist': 'geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular',
-    'geometry_msgs/msg/Wrench': 'geometry_msgs/Vector3 force\ngeometry_msgs/Vector3 torque',
-    'geometry_msgs/msg/WrenchStamped': 'std_msgs/Header header\ngeometry_msgs/Wrench wrench',
-    'sensor_msgs/msg/PointField': """
-        uint8 INT8=1
-        uint8 UINT8=2
-        uint8 INT16=3
-        uint8 UINT16=4
-        uint8 INT32=5
-        uint8 UINT32=6
-        uint8 FLOAT32=7
-        uint8 FLOAT64=8
-        string name
-        uint32 offset
-        uint8 datatype
-        uint32 count""",
-    'sensor_msgs/msg/PointCloud2': """
-        std_msgs/Header header
-        uint32 height
-        uint32 width
-        sensor_msgs/PointField[] fields
-        bool is_bigendian
-        uint32 point_step
-        uint32 row_step
-        uint8[] data
-        bool is_dense""",
-    'trajectory_msgs/msg/MultiDOFJointTrajectoryPoint': """
-        geometry_msgs/Transform[] transforms
-        geometry_msgs/Twist[] velocities
-        geometry_msgs/Twist[] accelerations
-        builtin_interfaces/Duration time_from_start""",
-    'trajectory_msgs/msg/MultiDOFJointTrajectory': """
-        std_msgs/Header header
-        string[] joint_names
-        trajectory_msgs/MultiDOFJointTrajectoryPoint[] points""",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,16 +49,6 @@ def typestore() -> Typestore:
     return get_typestore(Stores.ROS2_JAZZY)
 
 
-@lru_cache(maxsize=1)
-def input_types() -> Typestore:
-    """Return the message definitions of the input topics."""
-    store, types = get_typestore(Stores.EMPTY), {}
-    for name, text in DEFINITIONS.items():
-        types.update(get_types_from_msg(text, name))
-    store.register(types)
-    return store
-
-
 def decode(record: Record) -> Any:
     """
     Return the message of a record, as an object with the fields of its type.
@@ -109,8 +56,7 @@ def decode(record: Record) -> Any:
     :raises InputError: where the bytes are not a message of that type.
     """
     try:
-        types = input_types() if record.type in DEFINITIONS else typestore()
-        return types.deserialize_cdr(record.data, record.type)
+        return typestore().deserialize_cdr(record.data, record.type)
     except Exception as error:  # damaged bytes can raise anything
         raise InputError(
             f'{record.name} recorded at {record.log_time / 1e9:.3f} s',

@@ -20,14 +20,14 @@ class Advising:
 
     :param advice: what to do next; None: unknown yet.
     :param asked: number of trials, and where the DLO rested, when advice was sought last; None: seek it anew.
-    :param place: where the DLO rests.
+    :param resting_place: what is known of where the DLO rests.
     :param began: time of the first advice [s].
     :param minutes_left: until what is wanted is reached, at the speed so far; nan: unknown.
     """
 
     advice: NextAction | None = None
     asked: tuple[int, Chain] | None = None
-    place: RestingPlace = field(default_factory=RestingPlace)
+    resting_place: RestingPlace = field(default_factory=RestingPlace)
     began: float | None = None
     minutes_left: float = float('nan')
 

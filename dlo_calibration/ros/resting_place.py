@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dlo_calibration.messages.codec import ChainMessage, INITIAL, Message, NANOSECONDS
+from dlo_calibration.messages.codec import INITIAL, Message, NANOSECONDS
 from dlo_calibration.messages.collector import MARGIN
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.trial import Goal
@@ -51,9 +51,9 @@ class RestingPlace:
         self._acted = 0  # stamp of the newest action [ns]
 
     def take(self, message: Message, chain: Chain | None) -> None:
-        """Take a message, and the chain of the DLO that it has on the table, if it has one."""
+        """Take an action, or a message with a chain: that in the frame of the table."""
         seen, stamp = self._seen, message.stamp
-        if not isinstance(message, ChainMessage) or chain is None:
+        if chain is None:
             # A tracker tells an action when it is over, and has shown since where the DLO went.
             if seen is None or stamp >= seen.since:
                 self._seen, self._acted = None, stamp

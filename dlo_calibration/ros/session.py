@@ -275,7 +275,7 @@ class CalibrationSession(NodeSession[CalibratorOptions]):
         if message and not refusal:
             chain = message.chain if isinstance(message, ChainMessage) else None
             pose = self._collector.pose
-            self._state.advising.place.take(message, pose.chain(chain) if pose and chain else chain)
+            self._state.advising.resting_place.take(message, pose.chain(chain) if pose and chain else chain)
         if refusal:
             self.refuse(refusal)
         elif not self.calibrating and (self._state.name != 'done' or kind != GOAL):  # a tracker goes on
@@ -375,7 +375,7 @@ class CalibrationSession(NodeSession[CalibratorOptions]):
     def _begin_anew(self, why: str) -> None:
         """Begin another session because the clock went back."""
         self._order, self._began = StampOrder(self._order), self._clock()
-        self._state.advising.place = RestingPlace()
+        self._state.advising.resting_place = RestingPlace()
         if self._state.heard == float('-inf'):  # only initial chains came: there is no session to keep
             self.collecting = Collecting(self._graph.options().of_calibration)
             self._graph.warn(why)
@@ -531,7 +531,7 @@ class CalibrationSession(NodeSession[CalibratorOptions]):
         due = state.renewal.wanted and count > 0 and (quiet or since > 2.0)
         options, then = self._graph.options(), None
         last = self._collector.trials[-1].goals[-1] if count and not self._collector.incomplete else None
-        place = state.advising.place.find(last, quiet, options.pause)
+        place = state.advising.resting_place.find(last, quiet, options.pause)
         if place is not None and state.name != 'done' and state.advising.is_due(count, place):
             state.advising.asked, then = (count, place), self._asking(place)
         elif not due:

@@ -388,9 +388,7 @@ class Tracker:
                 break
             # What covers an end makes the DLO look shorter, and so does an end that is held in the air; both
             # move.
-            moved = np.linalg.norm(places - self._line.line[[0, -1]], axis=1).tolist()
-            if held:
-                moved = strange
+            moved = strange if held else np.linalg.norm(places - self._line.line[[0, -1]], axis=1).tolist()
             accepted[int(np.argmax(moved))] = False
         if excess > tolerance:
             # A part in the air looks longer: it is one that moves, or is hidden.

@@ -92,7 +92,7 @@ class BoardFinder:
             self._corners = self._shown
             return self._scale
         self._moves = self._moves or self._scale is not None and scale is not None
-        # The corners are followed from this image on: from image to image, a slow motion would be none.
+        # Later corners are compared with these: between neighbouring images, a slow motion looks like none.
         self._scale, self._shown, self._grey = scale, corners, grey
         self._corners = corners if kept.any() else corners[:0]
         return self._scale
