@@ -121,7 +121,7 @@ def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: 
                              starts=[residuals for residuals in drawn if residuals is not None],
                              hands=[residuals for residuals in others if residuals is not None],
                              slow=[residuals for residuals in slowly if residuals is not None])
-    uncertainty = extended(fit, uncertainty, residuals_at, fading)
+    uncertainty = extended(fit, uncertainty, residuals_at, fading, shift)
     elsewhere = [(there, restart) for there, restart in zip(drawn, restarted, strict=False)
                  if there is not None and np.sqrt(np.mean((there - residuals)**2)) > uncertainty.residual]
     uncertainty, simulated = scattered(fit, uncertainty, elsewhere, len(drawn))
@@ -166,21 +166,24 @@ def _linearised(point: Floats, residuals: Floats, layout: ResidualLayout, residu
 
 
 def extended(fit: Linearisation, uncertainty: Uncertainty, residuals_at: Evaluate,
-             fading: NDArray[np.bool_]) -> Uncertainty:
+             fading: NDArray[np.bool_], shift: Floats | None = None) -> Uncertainty:
     """
     Extend intervals to where the simulated residuals change as much as the linear model says.
 
     The effect of a stiffness fades as it grows: one end of an interval may fit clearly worse, the other not.
     An end whose effect is below 90 % of the expected one moves to twice its distance, four times at most;
     after that, it is the end of the scale.  From where the effect is larger than expected, it moves back.
-    The standard deviations grow with the intervals.
+    The standard deviations grow with the intervals.  A parameter that is uncertain because a finer simulation
+    moves it, (d,) `shift`, but not by noise, has an effect that is known.
     """
     point, ends = fit.point, np.stack([uncertainty.lower, uncertainty.upper])
     limits = np.stack([np.zeros(len(point)), np.broadcast_to(fit.upper, len(point))])
     excited = np.flatnonzero(uncertainty.excited)
     expected = DEVIATIONS * uncertainty.std
+    moved_by = np.zeros(len(point)) if shift is None else 2 * shift  # as `at_minimum` counts it
+    noisy = uncertainty.std**2 > SUSPECT**2 + moved_by**2
     unsure = [(side, int(k)) for k in excited for side in (0, 1)
-              if uncertainty.std[k] > SUSPECT and ends[side, k] != limits[side, k] and fading[k]]
+              if noisy[k] and ends[side, k] != limits[side, k] and fading[k]]
     short: dict[tuple[int, int], tuple[float, float]] = {}  # where the effect is too small, and how large
     for _ in range(4):
         if not unsure:

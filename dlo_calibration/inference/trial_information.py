@@ -404,7 +404,7 @@ class Appraiser:
         uncertainty = at_minimum(fit, layout, noise=self.noise, shift=shift, starts=starts)
         fading = np.array([name not in REST_SHAPE for name in self.space.free])
         return Appraisal(names, point, extended(
-            fit, uncertainty, lambda points: self._residuals(trials, points), fading), models)
+            fit, uncertainty, lambda points: self._residuals(trials, points), fading, shift), models)
 
     def _costs(self, trials: Sequence[Trial], points: Sequence[Floats] | Floats, loss: Huber) -> list[float]:
         """Return the cost [m^2] of all trials at each of the points; inf where one cannot be simulated."""

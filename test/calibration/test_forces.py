@@ -15,7 +15,8 @@ from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.observation.plausibility import implausible_trials
 from dlo_calibration.report.sentences import sentences
 
-SOFT = {**ROPE, 'elasticity': 30.0}
+# With less damping, the taut rope would still swing when it is seen.
+SOFT = {**ROPE, 'elasticity': 30.0, 'damping': 5.0}
 PULL = [((0,), (-0.05, 0, 0.3)), ((20,), (0.03, 0, 0.3))]  # stretches the rope
 OFFSET = np.array([0.3, -0.2, -2.0])  # N
 

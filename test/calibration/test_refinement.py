@@ -84,7 +84,7 @@ def test_an_even_dlo_stays_in_one_part():
 
 @pytest.mark.long
 def test_a_rest_shape_is_recovered_where_the_trials_show_it():
-    result = calibrated(observed(CURVED, REST_SHAPE), budget=300, names=('flexibility', 'torsion'))
+    result = calibrated(observed(CURVED, REST_SHAPE, sag=0.6), budget=300, names=('flexibility', 'torsion'))
     assert result.space.knots == 3
     assert result.space.parts == 1
     assert result.errors.mean < 2e-3
@@ -101,7 +101,7 @@ def test_a_straight_dlo_stays_straight():
 
 @pytest.mark.long
 def test_what_the_noise_of_the_starts_does_to_a_stiff_dlo_does_not_bend_it():
-    straight, noise = {'flexibility': 40.0, 'torsion': 60.0}, np.random.default_rng(1)
+    straight, noise = {'flexibility': 40.0, 'torsion': 60.0}, np.random.default_rng(3)
     trials = [replace(trial, initial=Chain(trial.initial.points + noise.normal(0, 5e-4, (POINTS, 3))))
               for trial in observed(ParameterSpace(tuple(straight)), straight)]
     result = calibrated(trials, names=tuple(straight))

@@ -14,7 +14,7 @@ from random_examples import drawing
 from stepping import NO_TABLE, properties, SteppedRod, Touching
 from test_rod import crumpled, GRAVITY, straight
 
-from dlo_calibration import Chain
+from dlo_calibration import Action, Chain, Goal, Hand
 from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.model.parameters import PARAMETERS, ParameterSpace, REST_SHAPE
 from dlo_calibration.model.trial import Trial
@@ -107,6 +107,19 @@ def test_rollouts_are_those_of_bullet(name):
         assert np.linalg.norm(rollout.chains - expected.chains, axis=-1).mean() < 1e-6
         assert (rollout.steps, rollout.settled) == (expected.steps, expected.settled)
     bullet.close()
+
+
+def test_a_dragged_rope_lies_where_shorter_steps_leave_it():
+    points = np.column_stack([np.linspace(0, 0.6, 21), np.zeros(21), np.full(21, 0.0039)])
+    way = np.array([points[20], (0.55, 0.12, 0.0239), (0.36, 0.12, 0.0239), (0.26, 0.02, 0.0239)])
+    action = Action((Hand('right', (20,), (0.0, 1.0, 2.2, 3.0), way),))
+    goal = Goal(Chain(points), 3.0, False, ('right',))
+    trial = Trial('trial 1', Chain(points), (action,), (goal,))
+    physical = ParameterSpace(mass=0.03).physical({'flexibility': 72.6, 'friction': 56.7}, 0.6)
+    fine, usual = (CompiledSimulator(time_step=step).simulate(trial, physical).chains[0]
+                   for step in (5e-4, 3e-3))
+    assert np.linalg.norm(fine - points, axis=1).mean() > 0.08
+    assert np.linalg.norm(usual - fine, axis=1).mean() < 1.5e-3
 
 
 def test_a_rollout_that_diverges_ends_at_once():

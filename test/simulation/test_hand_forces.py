@@ -70,8 +70,9 @@ def test_while_a_rope_swings_its_hand_bears_what_accelerates_it(simulator):
     middle = (rollout.chains[:, 1:] + rollout.chains[:, :-1]).mean(axis=1) / 2
     step = times[1] - times[0]
     acceleration = (middle[2:] - 2 * middle[1:-1] + middle[:-2]) / step**2
-    off = rollout.forces[1:-1] - DOWN + MASS * acceleration
-    assert np.linalg.norm(off) < 0.1 * np.linalg.norm(MASS * acceleration)
+    smoothed = acceleration - 0.01 * np.gradient(acceleration, step, axis=0)  # forces are, over 10 ms
+    off = rollout.forces[1:-1] - DOWN + MASS * smoothed
+    assert np.linalg.norm(off) < 0.05 * np.linalg.norm(MASS * acceleration)
 
 
 @pytest.mark.parametrize('force', [np.array([0, np.nan, 0]), np.zeros(2), np.array([0, 0, 1e9])])

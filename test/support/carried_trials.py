@@ -21,10 +21,17 @@ STIFF_MIDDLE = {**TRUTH, 'stiffness_2': 68.0, 'stiffness_3': 68.0, 'stiffness_4'
 NAMES = ('left_hand', 'right_hand')
 
 
-def carried(turn, lift):
-    """Return a trial of a DLO held in two clamps that sags while they carry it about."""
+def carried(turn, lift, sag=0.0):
+    """
+    Return a trial of a DLO held in two clamps that carry it about.
+
+    :param sag: angle of its ends at the start [rad]; a straight DLO buckles to any side.
+    """
     arc = np.linspace(0, LENGTH, POINTS)
     points = np.stack([arc, 0 * arc, 1 + 0 * arc], axis=1)
+    if sag:
+        angles = np.linspace(-sag, sag, POINTS)
+        points[:, ::2] = LENGTH / (2 * sag) * np.stack([np.sin(angles), 2 - np.cos(angles)], axis=1)
     times = np.array([0.0, 0.6, 1.2])
     right = points[-1] + [[0, 0, 0], [-0.3, turn, lift], [-0.3, -turn, 0]]
     left = points[0] + [[0, 0, 0], [0, 0, -lift], [0, turn, 0]]
@@ -33,9 +40,9 @@ def carried(turn, lift):
     return Trial(f'{turn:g} {lift:g}', Chain(points), (Action(hands),), goals)
 
 
-def observed(space, values):
+def observed(space, values, sag=0.0):
     """Return four trials of a DLO with these values, with half a millimetre of noise in what follows."""
-    trials = [carried(0.1, 0.2), carried(0.25, 0.0), carried(-0.1, 0.3), carried(0.0, -0.2)]
+    trials = [carried(*way, sag) for way in ((0.1, 0.2), (0.25, 0.0), (-0.1, 0.3), (0.0, -0.2))]
     noise = np.random.default_rng(4)
     engine, physical = CompiledSimulator(table=False, nodes=21), space.physical(values, mean_length(trials))
     rollouts = [engine.simulate(trial, physical) for trial in trials]

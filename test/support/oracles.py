@@ -22,7 +22,7 @@ def rod_velocities(rod, points, velocities):
     for offset, band in ((1, first[:-1]), (2, second[:-2])):
         bending += np.diag(band, offset) + np.diag(band, -offset)
     matrix = np.kron(np.diag(rod.masses * (1 + rod.drag * rod.step)) + rod.implicit * bending, np.eye(3))
-    forces = -bending @ points
+    forces, returned = -bending @ points, np.zeros_like(points)
     for i, segment in enumerate(np.diff(points, axis=0)):
         slack = 1 - rod.rest_lengths[i] / np.linalg.norm(segment)
         tension = rod.stiffness[i] * slack * segment
@@ -34,9 +34,12 @@ def rod_velocities(rod, points, velocities):
         taut = min(across * rod.step**2 / rod.masses[i:i + 2].min(), 1)
         implicit = rod.implicit + taut * max(rod.step**2 - rod.implicit, 0)
         matrix[3 * i:3 * i + 6, 3 * i:3 * i + 6] += implicit * ends
+        kept = implicit * across * min(2 - 2 * taut, 1) * (velocities[i] - velocities[i + 1])
+        returned[i] += kept
+        returned[i + 1] -= kept
     if len(rod.angles):
         forces += frame_forces(points, rod)
-    right = rod.masses[:, None] * velocities + rod.step * forces
+    right = rod.masses[:, None] * velocities + rod.step * forces + returned
     pull = HELD * rod.masses[rod.held, None]
     right[rod.held] += pull * rod.follow
     at = (3 * rod.held[:, None] + np.arange(3)).ravel()

@@ -229,7 +229,7 @@ def test_a_thin_loop_that_jumps_is_lost_until_all_of_it_is_found(radius, shift, 
     assert not tracker.next(first, STEP).lost
     far, _ = thin(shift)
     found = [tracker.next(far, STEP) for _ in range(8)]
-    # A part that is there to be seen is not called hidden.
-    assert all(one.lost or np.isfinite(one.pixels[1:-1, 0]).sum() > 36 for one in found)
+    # A part that is there to be seen is not called hidden: of 39 points, the loop has 18.
+    assert all(one.lost or np.isfinite(one.pixels[1:-1, 0]).sum() > 30 for one in found)
     assert found[0].lost
     assert found[-1].lost != found_again

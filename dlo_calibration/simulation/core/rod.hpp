@@ -18,6 +18,11 @@
 // length of a segment within a step, T dt^2 / (l m) >= 1, and a share of it with less tension.  The negative
 // part of the matrix of a compressed spring is omitted, so that the whole matrix stays positive definite.
 //
+// The part of a spring's matrix across its segment, its tension over its length, would damp the segment's
+// turning, which nothing in a DLO does: a DLO that is dragged would rub as if friction were a few percent
+// larger.  So the right side has the same part times v, and what is left is inertia.  A taut DLO needs the
+// damping: what is returned falls from all at T dt^2 / (l m) = 1/2 to nothing at 1.
+//
 // A segment that turns by phi in a step is phi^2 / 2 longer after it, which the next step takes back.  Springs
 // linearised where the last velocities lead, also smoothed ones, take a third of that error away where a DLO
 // is dragged around a peg, but are unstable: in long steps, and where a rope is pulled taut around a peg,
@@ -49,7 +54,7 @@ inline void find_springs(Rods<Number>& rods) {
     const Number taut = min(across * (step * step) / min(masses[i], masses[i + 1]), 1.0);
     const Number part = implicit + taut * missing;
     springs[i] = {across * part, part * (stiffness - across) * inverse * inverse,
-                  stiffness * slack * step};
+                  stiffness * slack * step, across * part * min(2.0 - 2.0 * taut, 1.0)};
     if (framed) tangents[i] = inverse * segment, inverse_lengths[i] = inverse;
   }
 }
@@ -115,9 +120,9 @@ inline void solve(Rods<Number>& rods) {
   Number xx = none, yy = none, zz = none, xy = none, xz = none, yz = none;  // of the segment before
   Vec3<Number> before{};                                                    // its impulse
   for (int i = 0; i < n; ++i) {
-    Vec3<Number> force = bending[i][0] * points[i], segment{};
+    Vec3<Number> force = bending[i][0] * points[i], segment{}, apart{};
     if (i + 1 < n) {
-      segment = points[i + 1] - points[i];
+      segment = points[i + 1] - points[i], apart = velocities[i + 1] - velocities[i];
       force = force + bending[i][1] * points[i + 1];
     }
     if (i + 2 < n) force = force + bending[i][2] * points[i + 2];
@@ -140,7 +145,7 @@ inline void solve(Rods<Number>& rods) {
     xx = spring.along * x * x + spring.across, yy = spring.along * y * y + spring.across;
     zz = spring.along * z * z + spring.across;
     xy = spring.along * x * y, xz = spring.along * x * z, yz = spring.along * y * z;
-    before = spring.impulse * segment;
+    before = spring.impulse * segment - spring.returned * apart;
     impulse = impulse + before;
     Vec3<Number>& result = predicted[i];
     Number dx = ax + xx, dy = ay + yy, dz = az + zz;
@@ -186,13 +191,16 @@ template <class Number>
 inline void find_tensions(Rods<Number>& rods) {
   const double step = rods.step;
   const auto *points = rods.points.data(), *velocities = rods.predicted.data();
+  const auto* former = rods.velocities.data();
   const auto* springs = rods.springs.data();
   auto* tensions = rods.tensions.data();
   for (int i = 0; i + 1 < rods.nodes; ++i) {
     const Vec3<Number> segment = points[i + 1] - points[i], apart = velocities[i + 1] - velocities[i];
     const Number square = dot(segment, segment);
-    const auto& [across, along, impulse] = springs[i];
-    tensions[i] = (impulse * square + (along * square + across) * dot(segment, apart)) / (step * sqrt(square));
+    const auto& [across, along, impulse, returned] = springs[i];
+    const Vec3<Number> damped =
+        (along * square + across) * apart - returned * (former[i + 1] - former[i]);
+    tensions[i] = (impulse * square + dot(segment, damped)) / (step * sqrt(square));
   }
 }
 

@@ -32,6 +32,7 @@ template <class Number>
 struct Spring {
   Number across, along;  // stiffness [kg] across the segment, and along it divided by its squared length
   Number impulse;        // [kg/s], to be multiplied by the segment
+  Number returned;       // the share of `across` [kg] that is to damp nothing
 };
 
 /// Entries of the bending matrix [N/m] at a node: the diagonal, and the two below it.
