@@ -118,13 +118,14 @@ class _Ladder:
         """
         Try rungs, each from the previous one, until two of them predict no better than the best.
 
-        A single one may mislead: two parts do not show that a DLO is stiff in the middle, four do. One that
-        predicts better, but not significantly, is not kept; nor does it count as a failure.
+        A single one may mislead: two parts do not show that a DLO is stiff in the middle, four do.  The first
+        one that is kept must predict significantly better; finer ones, whose kind is shown then, only better
+        in the mean.  One that does so before is not kept; nor does it count as a failure.
 
         :param rungs: the number of knots or parts of each, and how to refine a space.
         :returns: why it ended, in words; empty if there is no finer rung.
         """
-        why, latest, missed = '', self.best, 0
+        why, latest, missed, shown = '', self.best, 0, False
         for count, finer in rungs:
             if self.best.explained(self._level):
                 break
@@ -142,10 +143,10 @@ class _Ladder:
             if stage is not None and errors is not None:
                 if self._best_errors is None:
                     self._best_errors = self._fold_errors(self.best)
-                if predicts_better(errors, self._best_errors):
-                    self.best, self._best_errors, why = stage, errors, ''
-                    continue
                 promising = log_gains(errors, self._best_errors).mean() > LEAST_GAIN
+                if shown and promising or predicts_better(errors, self._best_errors):
+                    self.best, self._best_errors, why, shown = stage, errors, '', True
+                    continue
             why = f': {count} would explain too little' if stage is None else \
                 f': {count} would not predict left-out trials better'
             missed += not promising

@@ -43,8 +43,10 @@ from dlo_calibration.vision.two_views import axis_of_two_views
 
 SNAP = 0.25  # spacings of a chain: a hand nearer than this to an end, or to another grip, is put there
 
-#: Slow errors of a film, as rendered ones have them (benchmark/film_trials.py).
+#: Slow errors of a film, and of photographs whose marks of a hand are off by a millimetre, as rendered ones
+#: have them (benchmark/film_trials.py, benchmark/from_photographs.py).
 FILM_ERRORS = {'slow_chain_error': 0.0005, 'slow_hand_error': 0.002}
+PHOTOGRAPH_ERRORS = {'slow_chain_error': 0.0003, 'slow_hand_error': 0.003}
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,8 +254,10 @@ class Drafts:
     def options(self) -> dict[str, Any]:
         """The options of these trials, by name."""
         hang = [draft.hangs for draft in self.trials]
-        options = measured_options(self.diameter, with_ends(self.mass) if hang and all(hang) else self.mass,
-                                   filmed=self.filmed_diameter is not None)
+        only_hangs = bool(hang) and all(hang)
+        errors = FILM_ERRORS if self.filmed_diameter is not None else {} if only_hangs else PHOTOGRAPH_ERRORS
+        options = measured_options(self.diameter, with_ends(self.mass) if only_hangs else self.mass,
+                                   errors=errors)
         return {**options, 'nodes': NODES} if any(hang) else options
 
     def plain(self) -> dict[str, Any]:
@@ -309,7 +313,8 @@ class Drafter:
                       place_obstacles(document, photographs))
 
 
-def measured_options(diameter: float | None, mass: float = 0.0, *, filmed: bool = False) -> dict[str, Any]:
+def measured_options(diameter: float | None, mass: float = 0.0, *, errors: Mapping[str, float]
+                     ) -> dict[str, Any]:
     """
     Return the options of trials that a camera observed, by name.
 
@@ -317,11 +322,9 @@ def measured_options(diameter: float | None, mass: float = 0.0, *, filmed: bool 
 
     :param diameter: of the DLO [m]; None: unknown.
     :param mass: of the DLO [kg]; 0: unknown.
-    :param filmed: whether a film shows trials.
+    :param errors: slow errors of what the camera showed, by the names of their options; may be empty.
     """
-    options: dict[str, Any] = {'table': True, 'table_height': 0.0, 'mass': mass}
-    if filmed:
-        options |= FILM_ERRORS
+    options: dict[str, Any] = {'table': True, 'table_height': 0.0, 'mass': mass, **errors}
     if diameter is not None:
         value = BY_NAME['self_collision'].value(diameter / 2)
         options['self_collision'] = min(max(value, 0.0), SCALE)

@@ -17,7 +17,7 @@ from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.capture.document import MarkEntry
 from dlo_calibration.capture.filming import Filming, HeldPoint
 from dlo_calibration.capture.following import filmed_trials, FilmedTrial, FRAME, views_of, WITHOUT_LENS, ZERO
-from dlo_calibration.capture.trials import measured_options
+from dlo_calibration.capture.trials import FILM_ERRORS, measured_options
 from dlo_calibration.cli.output import print_json, print_message, standard_output
 from dlo_calibration.cli.trace import check_count, pixels_of, places_of
 from dlo_calibration.errors import InputError
@@ -89,7 +89,7 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
         if trials:
             messages = episode_messages([own.episode for own in trials], FRAME, ZERO)
             write_records(chosen.output / SESSION, message_records(messages),
-                          measured_options(round(2.0 * filming.radius, 4), filmed=True))
+                          measured_options(round(2.0 * filming.radius, 4), errors=FILM_ERRORS))
         _draw(film, views, chosen.output / TRACKED)
     elapsed = time.perf_counter() - begin
     report = _report(views, filming, trials, problems, spent, elapsed)

@@ -137,7 +137,7 @@ def test_a_sensitive_outlier_widens_intervals_but_decides_nothing(session):
 
 MASS, LENGTH, RADIUS = 0.03, 0.6, 0.004  # kg, m, m
 TRUE = {'flexibility': 72.3, 'elasticity': 40.0, 'friction': 65.0, 'self_collision': 25.6, 'damping': 50.0}
-GENTLE = ((0, (0.10, 0.20), 0.0), (10, (0.15, -0.18), 1.3), (20, (-0.25, 0.12), 2.6), (5, (0.10, 0.10), 0.5))
+GENTLE = ((0, (0.10, 0.20), 0.0), (10, (0.15, -0.18), 1.3), (20, (-0.25, 0.12), 2.6), (16, (0.10, 0.10), 0.5))
 
 
 def observed_trial(number, grip, way, times, heading, **true):

@@ -72,7 +72,7 @@ def test_while_a_rope_swings_its_hand_bears_what_accelerates_it(simulator):
     acceleration = (middle[2:] - 2 * middle[1:-1] + middle[:-2]) / step**2
     smoothed = acceleration - 0.01 * np.gradient(acceleration, step, axis=0)  # forces are, over 10 ms
     off = rollout.forces[1:-1] - DOWN + MASS * smoothed
-    assert np.linalg.norm(off) < 0.05 * np.linalg.norm(MASS * acceleration)
+    assert np.linalg.norm(off) < 0.07 * np.linalg.norm(MASS * acceleration)
 
 
 @pytest.mark.parametrize('force', [np.array([0, np.nan, 0]), np.zeros(2), np.array([0, 0, 1e9])])

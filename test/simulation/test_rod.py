@@ -61,6 +61,28 @@ def test_forces_are_the_slope_of_the_energy(seed, equal):
     assert simulated == pytest.approx(expected, abs=1e-5 * np.abs(expected).max())
 
 
+@pytest.mark.parametrize('step', [1.5e-3, 3e-3, 6e-3])
+@pytest.mark.parametrize('internal_damping', [2e-3, 1e-2])
+def test_a_vibration_fades_as_its_internal_damping_says_whatever_the_step(internal_damping, step):
+    """The lowest mode of a free beam (Rao, Mechanical Vibrations, 8.5) with Kelvin-Voigt damping."""
+    rest, length = np.full(40, 0.0125), 0.5
+    physical = properties(1e-2, 500.0, 0.05, internal_damping=internal_damping)
+    frequency = 4.730041**2 * np.sqrt(1e-2 / (0.05 * length**3))  # rad/s
+    rod, points = Rod(rest, physical, step), straight(rest)
+    along = 4.730041 * points[:, 0] / length
+    shape = np.cosh(along) + np.cos(along) - 0.982502 * (np.sinh(along) + np.sin(along))
+    points[:, 2] = 1e-3 * shape
+    velocities, places, speeds = np.zeros_like(points), [], []
+    for _ in range(round(1.2 / step)):
+        velocities = rod.velocities(points, velocities, NONE, FREE)
+        points = points + step * velocities
+        places.append(points[:, 2] @ shape)
+        speeds.append(velocities[:, 2] @ shape / frequency)
+    times = step * np.arange(len(places))
+    fading = -np.polyfit(times, np.log(np.hypot(places, speeds)), 1)[0]
+    assert fading == pytest.approx(internal_damping * frequency**2 / 2, rel=0.05)
+
+
 def test_a_straight_rod_of_its_rest_length_has_no_force():
     rest = np.array([0.03, 0.05, 0.02, 0.06])
     turned = straight(rest) @ np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]

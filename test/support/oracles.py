@@ -22,7 +22,7 @@ def rod_velocities(rod, points, velocities):
     for offset, band in ((1, first[:-1]), (2, second[:-2])):
         bending += np.diag(band, offset) + np.diag(band, -offset)
     matrix = np.kron(np.diag(rod.masses * (1 + rod.drag * rod.step)) + rod.implicit * bending, np.eye(3))
-    forces, returned = -bending @ points, np.zeros_like(points)
+    forces, returned = -bending @ points, rod.surplus * bending @ velocities
     for i, segment in enumerate(np.diff(points, axis=0)):
         slack = 1 - rod.rest_lengths[i] / np.linalg.norm(segment)
         tension = rod.stiffness[i] * slack * segment

@@ -380,7 +380,8 @@ py::dict state_of(const Rope& rope) {
   for (const Clamp& clamp : rope.clamps)
     clamps.append(py::make_tuple(clamp.segment, array_of(std::vector<Point>{clamp.direction}).squeeze()));
   return py::dict(
-      "drag"_a = rods.drag, "implicit"_a = rods.implicit, "rest_lengths"_a = array_of(rods.rest_lengths),
+      "drag"_a = rods.drag, "implicit"_a = rods.implicit, "surplus"_a = rods.surplus,
+      "rest_lengths"_a = array_of(rods.rest_lengths),
       "stiffness"_a = array_of(rods.stiffness), "masses"_a = array_of(rods.masses),
       "bending"_a = array_of(rods.bending), "natural"_a = array_of(rods.natural),
       "twisting"_a = array_of(rods.twisting), "angles"_a = array_of(rods.angles),

@@ -12,11 +12,14 @@
 // Simulation, 1998, equation 6.  For one mode of a linear spring, every c >= dt^2 / 2 is stable at any
 // stiffness, and the determinant shows that c damps the mode like a stiffness-proportional damping of c / dt.
 // So c is dt times the internal damping, but at least 0.6 dt^2 for stability (at 0.5 dt^2 the stiffest modes
-// would ring for ever); at this limit the damping depends on the time step.  That holds for small movements
-// alone: a taut DLO that vibrates across turns its stiff springs within a step, and gains energy until it
-// flies away.  With c = dt^2 it does not; so the springs get that where the tension would move a node by the
-// length of a segment within a step, T dt^2 / (l m) >= 1, and a share of it with less tension.  The negative
-// part of the matrix of a compressed spring is omitted, so that the whole matrix stays positive definite.
+// would ring for ever).  Of bending, the right side has the surplus times K v, so that its damping does not
+// depend on the time step; 0.2 dt^2 stay, as nothing would damp the stiffest modes.
+//
+// That holds for small movements alone: a taut DLO that vibrates across turns its stiff springs within a step,
+// and gains energy until it flies away.  With c = dt^2 it does not; so the springs get that where the tension
+// would move a node by the length of a segment within a step, T dt^2 / (l m) >= 1, and a share of it with less
+// tension.  The negative part of the matrix of a compressed spring is omitted, so that the whole matrix stays
+// positive definite.
 //
 // The part of a spring's matrix across its segment, its tension over its length, would damp the segment's
 // turning, which nothing in a DLO does: a DLO that is dragged would rub as if friction were a few percent
@@ -85,7 +88,7 @@ inline void solve(Rods<Number>& rods) {
   const int n = rods.nodes;
   const bool framed = rods.framed, strands_rub = !rods.strand_forces.empty();
   const double step = rods.step;
-  const Number drag = rods.drag, implicit = rods.implicit;
+  const Number drag = rods.drag, implicit = rods.implicit, surplus = rods.surplus;
   const auto* points = rods.points.data(), *velocities = rods.velocities.data();
   const auto* bending = rods.bending.data();
   const auto* masses = rods.masses.data();
@@ -120,16 +123,17 @@ inline void solve(Rods<Number>& rods) {
   Number xx = none, yy = none, zz = none, xy = none, xz = none, yz = none;  // of the segment before
   Vec3<Number> before{};                                                    // its impulse
   for (int i = 0; i < n; ++i) {
-    Vec3<Number> force = bending[i][0] * points[i], segment{}, apart{};
+    const auto bent = [&](int k) { return step * points[k] - surplus * velocities[k]; };
+    Vec3<Number> unbending = bending[i][0] * bent(i), segment{}, apart{};
     if (i + 1 < n) {
       segment = points[i + 1] - points[i], apart = velocities[i + 1] - velocities[i];
-      force = force + bending[i][1] * points[i + 1];
+      unbending = unbending + bending[i][1] * bent(i + 1);
     }
-    if (i + 2 < n) force = force + bending[i][2] * points[i + 2];
-    if (i > 0) force = force + bending[i - 1][1] * points[i - 1];
-    if (i > 1) force = force + bending[i - 2][2] * points[i - 2];
+    if (i + 2 < n) unbending = unbending + bending[i][2] * bent(i + 2);
+    if (i > 0) unbending = unbending + bending[i - 1][1] * bent(i - 1);
+    if (i > 1) unbending = unbending + bending[i - 2][2] * bent(i - 2);
     const Number mass = masses[i];
-    Vec3<Number> impulse = mass * (velocities[i] + fall) - step * force;
+    Vec3<Number> impulse = mass * (velocities[i] + fall) - unbending;
     Number diagonal = mass * (1.0 + drag * step) + implicit * bending[i][0];
     Number first = implicit * bending[i][1], second = implicit * bending[i][2];
     if (strands_rub) {

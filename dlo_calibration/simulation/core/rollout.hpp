@@ -249,7 +249,8 @@ class LaneGroup {
   }
 
   void load(Rods<double>& rods, int lane) {
-    in_lane(rods_.drag, lane) = rods.drag, in_lane(rods_.implicit, lane) = rods.implicit;
+    in_lane(rods_.drag, lane) = rods.drag;
+    in_lane(rods_.implicit, lane) = rods.implicit, in_lane(rods_.surplus, lane) = rods.surplus;
     in_lane(rods_.friction, lane) = rods.friction, in_lane(rods_.level, lane) = rods.level;
     const auto copy = [lane](auto& rows, const auto& from) {
       each_number(rows, from, lane, [](double& a, double b) { a = b; });

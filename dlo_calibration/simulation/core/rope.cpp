@@ -38,6 +38,7 @@ Rope::Rope(const Start& start, const Properties& properties, double step, Point 
   rods.nodes = n, rods.step = step, rods.gravity = gravity, rods.level = level;
   rods.friction = properties.friction, rods.drag = properties.drag;
   rods.implicit = step * std::max(properties.internal_damping, 0.6 * step);
+  rods.surplus = rods.implicit - step * std::max(properties.internal_damping, 0.2 * step);
   rods.strands_rub = properties.bending_friction > 0.0, rods.locks = properties.locking > 0.0;
   rods.resize();
   rods.points = start.points, rods.velocities = start.velocities, rods.solved = 1.0;

@@ -104,7 +104,7 @@ struct Rods {
   Point gravity{};       // [m/s^2]
 
   // Properties.
-  Number drag, implicit;   // [1/s]; c [s^2], see rod.hpp
+  Number drag, implicit, surplus;  // [1/s]; c, and what of it is to damp no bending [s^2], see rod.hpp
   Number friction, level;  // of the table; height of nodes that touch it [m]
   std::vector<Number> rest_lengths, stiffness, masses;
   std::vector<Bending<Number>> bending;
