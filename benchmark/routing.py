@@ -177,7 +177,7 @@ def dragged(dlo: KnownDlo, points: Floats, grip: int, places: Floats, surroundin
         return None
     path = np.column_stack([way, np.full(len(way), points[grip, 2])])
     legs = np.maximum(np.linalg.norm(np.diff(path, axis=0), axis=1), 1e-4)
-    hand = Hand('hand_1', (grip,), np.append(0.0, np.cumsum(legs)) / PLAN.speed, path)
+    hand = Hand('hand_1', (grip,), np.append(0.0, np.cumsum(legs)) / PLAN.of_length(dlo.length).speed, path)
     steps = (ActionStep(Action((hand,))),)
     rehearsal, = rehearse(Pool(simulator), [RehearsalJob(Chain(points), steps, dlo.physical)])
     settled = not rehearsal.failure and all(rehearsal.settled)
