@@ -119,8 +119,8 @@ class _Ladder:
         Try rungs, each from the previous one, until two of them predict no better than the best.
 
         A single one may mislead: two parts do not show that a DLO is stiff in the middle, four do.  The first
-        one that is kept must predict significantly better; finer ones, whose kind is shown then, only better
-        in the mean.  One that does so before is not kept; nor does it count as a failure.
+        rung that is kept must predict significantly better.  Until then, one that predicts better in the mean
+        alone is not kept, but is no failure; after it, that is enough.
 
         :param rungs: the number of knots or parts of each, and how to refine a space.
         :returns: why it ended, in words; empty if there is no finer rung.

@@ -255,7 +255,11 @@ class Drafts:
         """The options of these trials, by name."""
         hang = [draft.hangs for draft in self.trials]
         only_hangs = bool(hang) and all(hang)
-        errors = FILM_ERRORS if self.filmed_diameter is not None else {} if only_hangs else PHOTOGRAPH_ERRORS
+        errors = PHOTOGRAPH_ERRORS
+        if self.filmed_diameter is not None:
+            errors = FILM_ERRORS
+        elif only_hangs:
+            errors = {}
         options = measured_options(self.diameter, with_ends(self.mass) if only_hangs else self.mass,
                                    errors=errors)
         return {**options, 'nodes': NODES} if any(hang) else options

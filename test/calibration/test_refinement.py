@@ -141,7 +141,16 @@ def test_a_rod_whose_errors_have_another_cause_does_not_lock():
 
 @pytest.mark.parametrize('first, kept', [((-0.8, -0.6, -0.3, 0.5), 3), ((0.1, 0.1, 0.1, 0.1), 0)])
 def test_rungs_that_predict_better_but_not_significantly_do_not_end_a_climb(monkeypatch, first, kept):
-    logarithms = [np.zeros(4), np.array(first), np.array(first), np.full(4, -1.0)]
+    assert climbed(monkeypatch, np.zeros(4), np.array(first), np.array(first), np.full(4, -1.0)) == kept
+
+
+@pytest.mark.parametrize('finer, kept', [((-0.8, -0.6, -0.3, 0.5), 2), ((0.1, 0.1, 0.1, 0.1), 1)])
+def test_once_a_rung_is_kept_a_finer_one_need_only_predict_better_in_the_mean(monkeypatch, finer, kept):
+    assert climbed(monkeypatch, np.zeros(4), np.full(4, -1.0), np.array(finer) - 1, np.zeros(4)) == kept
+
+
+def climbed(monkeypatch, *logarithms):
+    """Return which rung a climb keeps, from the logarithms of the errors of each."""
     rungs = [SimpleNamespace(space=EVEN, best=SimpleNamespace(point=None), evaluations=(), validated=0,
                              errors=np.exp(logarithm), explained=lambda level: False)
              for logarithm in logarithms]
@@ -150,7 +159,7 @@ def test_rungs_that_predict_better_but_not_significantly_do_not_end_a_climb(monk
     monkeypatch.setattr(ladder, '_fitted', lambda *arguments: next(coming))
     monkeypatch.setattr(ladder, '_fold_errors', lambda rung: rung.errors)
     ladder.climb([(count, lambda space, point: (space, point)) for count in (3, 5, 9)])
-    assert ladder.best is rungs[kept]
+    return [rung is ladder.best for rung in rungs].index(True)
 
 
 def test_a_small_budget_leaves_the_dlo_even_and_says_so(stiff_middle):

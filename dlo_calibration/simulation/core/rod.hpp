@@ -12,8 +12,8 @@
 // Simulation, 1998, equation 6.  For one mode of a linear spring, every c >= dt^2 / 2 is stable at any
 // stiffness, and the determinant shows that c damps the mode like a stiffness-proportional damping of c / dt.
 // So c is dt times the internal damping, but at least 0.6 dt^2 for stability (at 0.5 dt^2 the stiffest modes
-// would ring for ever).  Of bending, the right side has the surplus times K v, so that its damping does not
-// depend on the time step; 0.2 dt^2 stay, as nothing would damp the stiffest modes.
+// would ring for ever).  Of bending, the right side gives back c K v beyond the internal damping, so that
+// vibrations fade alike for every time step; at least 0.2 dt^2 stay, to damp the stiffest modes.
 //
 // That holds for small movements alone: a taut DLO that vibrates across turns its stiff springs within a step,
 // and gains energy until it flies away.  With c = dt^2 it does not; so the springs get that where the tension
@@ -122,8 +122,8 @@ inline void solve(Rods<Number>& rods) {
   };
   Number xx = none, yy = none, zz = none, xy = none, xz = none, yz = none;  // of the segment before
   Vec3<Number> before{};                                                    // its impulse
+  const auto bent = [&](int k) { return step * points[k] - surplus * velocities[k]; };  // what bending resists
   for (int i = 0; i < n; ++i) {
-    const auto bent = [&](int k) { return step * points[k] - surplus * velocities[k]; };
     Vec3<Number> unbending = bending[i][0] * bent(i), segment{}, apart{};
     if (i + 1 < n) {
       segment = points[i + 1] - points[i], apart = velocities[i + 1] - velocities[i];
