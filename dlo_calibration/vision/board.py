@@ -67,6 +67,20 @@ PAPERS: Mapping[str, Paper] = {'a4': Paper('A4', 0.210, 0.297, 0),
                                'letter': Paper('Letter', 0.2159, 0.2794, MARKERS)}
 
 
+def sheet_outline(printed: float = RULER) -> Floats:
+    """
+    Return the corners (4, 2) of the paper around the board, in the board's frame [m].
+
+    :param printed: length of the board's ruler line, as measured on the print [m].
+    """
+    # Of every size of paper.  A printer that changes the size leaves the middle of the page where it was.
+    half_width = max(paper.width for paper in PAPERS.values()) / 2.0
+    height = max(paper.height for paper in PAPERS.values())
+    middle = COLUMNS * SQUARE / 2.0
+    corners = np.array([(-half_width, 0.0), (half_width, 0.0), (half_width, height), (-half_width, height)])
+    return (corners + (middle, -BOTTOM)) * (printed / RULER)
+
+
 def marker_squares() -> list[tuple[int, int]]:
     """Return column and row, from the upper left, of each square with a marker, in the markers' order."""
     places = itertools.product(range(ROWS), range(COLUMNS))

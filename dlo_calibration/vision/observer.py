@@ -100,7 +100,8 @@ class Observer:
     """
 
     def __init__(self, scale: Scale | BoardFinder | None, count: int = COUNT) -> None:
-        self._given, self._tracker, self._finder = scale, Tracker(count), TagFinder()
+        sheet = scale.sheet if isinstance(scale, BoardFinder) else None
+        self._given, self._tracker, self._finder = scale, Tracker(count, sheet), TagFinder()
         self._time = 0.0
 
     def start(self, time: float, pixels: Pixels, clicks: ArrayLike) -> ImageView:

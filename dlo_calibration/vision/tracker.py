@@ -133,10 +133,12 @@ class Tracker:
     Follows a DLO from image to image, forwards or backwards in time.
 
     :param count: of points along the DLO.
+    :param sheet: corners (k, 2) on the table [m] of a sheet of paper, which is not the DLO though it may have
+        its colour; None: there is none, or no scale.
     """
 
-    def __init__(self, count: int = COUNT) -> None:
-        self._count = count
+    def __init__(self, count: int = COUNT, sheet: Floats | None = None) -> None:
+        self._count, self._sheet = count, sheet
 
     def start(self, pixels: Pixels, clicks: ArrayLike, scale: Scale | None = None) -> Tracked:
         """
@@ -424,7 +426,14 @@ class Tracker:
                                 cv2.COLOR_RGB2Lab)
         # A mixture of colours, as of skin, has some pixels of the DLO's colour; the DLO has no others.
         side = max(2, round(0.6 * self._width() / factor))
-        return np.asarray(cv2.blur(odds(self._table, lab), (side, side)) > self._alike), factor
+        mask = np.asarray(cv2.blur(odds(self._table, lab), (side, side)) > self._alike)
+        if self._sheet is not None and self._scale is not None:
+            corners = np.column_stack([self._sheet, np.zeros(len(self._sheet))])
+            outline = self._scale.to_pixels(corners) / factor
+            if np.isfinite(outline).all():
+                paper = cv2.fillPoly(np.zeros(mask.shape, np.uint8), [np.rint(outline).astype(np.int32)], 1)
+                mask = mask & (paper == 0)
+        return mask, factor
 
     def _unexplained(self, pixels: Pixels, line: Floats) -> tuple[float, float]:
         """Return the areas with the DLO's colour elsewhere and at the line, as shares of the usual one."""

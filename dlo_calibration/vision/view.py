@@ -20,7 +20,15 @@ from scipy.optimize import least_squares
 
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.vision.board import COLUMNS, FEWEST_CORNERS, find_board, ROWS, RULER, SQUARE
+from dlo_calibration.vision.board import (
+    COLUMNS,
+    FEWEST_CORNERS,
+    find_board,
+    ROWS,
+    RULER,
+    sheet_outline,
+    SQUARE,
+)
 from dlo_calibration.vision.film import Film
 from dlo_calibration.vision.lens import Lens
 from dlo_calibration.vision.photograph import Pixels
@@ -64,6 +72,11 @@ class BoardFinder:
         self._shown: Floats = np.zeros((0, 2))  # corners when the scale was made
         self._since = AGAIN  # images since the last search
         self._moves = False
+
+    @property
+    def sheet(self) -> Floats:
+        """The corners (4, 2) of the paper around the board, on the table [m]."""
+        return sheet_outline(self._printed)
 
     def next(self, pixels: Pixels) -> Scale | None:
         """

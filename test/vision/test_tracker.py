@@ -8,13 +8,16 @@ import functools
 
 import cv2
 from films import Instant, plain_look, Renderer
+from laid_board import LaidBoard
 import numpy as np
 from photographs import Camera, Hand
 import pytest
 
 from dlo_calibration.vision.lens import Lens
+from dlo_calibration.vision.observer import Observer
 from dlo_calibration.vision.scale import Scale
 from dlo_calibration.vision.tracker import Tracker
+from dlo_calibration.vision.view import BoardFinder
 
 LENGTH, RADIUS = 0.5, 0.005  # m
 COUNT = 21
@@ -233,3 +236,21 @@ def test_a_thin_loop_that_jumps_is_lost_until_all_of_it_is_found(radius, shift, 
     assert all(one.lost or np.isfinite(one.pixels[1:-1, 0]).sum() > 30 for one in found)
     assert found[0].lost
     assert found[-1].lost != found_again
+
+
+@pytest.mark.long
+def test_a_white_dlo_is_told_from_the_white_sheet_that_a_hand_partly_hides():
+    look = plain_look(colour=(0.92, 0.92, 0.9), ground='cloth', ground_colour=(0.22, 0.25, 0.3))
+    board = LaidBoard((0.3, -0.45), 0.1)
+    white = Renderer(replace(look, sheets=(board.sheet,)), RADIUS, (-0.3, -0.5), (0.8, 0.5))
+    camera = Camera((1280, 960), 1240.0, 0.3, 0.1, 0.0, 1.0, (0.27, -0.08))
+    curve = bent(0.4, (0.0, 0.05))
+    observer = Observer(BoardFinder(Lens(camera.size, camera.matrix, np.zeros(4))), COUNT)
+    for k in range(5):
+        pixels = white.image([Instant(camera, curve, (Hand((0.42, -0.46 + 0.05 * k)),))])
+        found = observer.next(k * STEP, pixels) if k else observer.start(
+            0.0, pixels, camera.project(points_of(curve)[::5]) + 2.0)
+        assert not found.tracked.lost, found.tracked.reason
+        assert np.isfinite(found.tracked.pixels[1:-1]).all()
+        off = (found.points(RADIUS) - board.seen_from(points_of(curve)))[:, :2]
+        assert np.nanmax(np.linalg.norm(off, axis=1)) < FAR
