@@ -130,7 +130,7 @@ def searched(setting: Setting, prior: Prior) -> Fit:
     search = SEARCHES[options.search](space.dimension, options.seed, prior.hints)
     if options.search != LeastSquares.name:
         return fit(setting, space, search, options.evaluations)
-    most = budget(space.dimension) if refines else options.evaluations
+    most = budget(space.dimension, options.search) if refines else options.evaluations
     best = fit(setting, space, search, min(most, options.evaluations))
     while True:
         best = refine(setting, best, options.evaluations) if refines else best
@@ -147,7 +147,7 @@ def _other_search(setting: Setting, prior: Prior, best: Fit) -> Fit | None:
     In a narrow, curved valley, as of flexibility and friction, a search may end far from the minimum.
     """
     options, space, spent = setting.options, prior.space, len(best.evaluations)
-    left = min(budget(space.dimension), options.evaluations - spent)
+    left = min(budget(space.dimension, options.search), options.evaluations - spent)
     if best.stopped or setting.should_stop() or left < AGAIN * space.dimension or \
             best.explained(noise(setting.trials)):
         return None

@@ -23,6 +23,7 @@ DECIDED = ('calibrate', 'evaluations')  # names of the options that may be open
 
 PAPER_ROUNDS = 150  # evaluations; enough for the paper's four parameters
 LINEARISATIONS = 15  # in the budget of a search; a Gauss-Newton descent needs about 10
+VALLEYS = 100  # evaluations, beside those, in which least squares looks along valleys
 REFINEMENT = 400  # evaluations, beside those of one search, to choose rest shape and parts
 
 
@@ -60,7 +61,7 @@ def choose(trials: Sequence[Trial], options: Options, evidence: GripEvidence | N
             words += f' Corrected: {", ".join(errors)}, because {evidence.words(errors)}.'
     if options.evaluations == 0:
         ladders = chooses_parts(trials, options) * (1 + may_lock(options.space))
-        rounds = budget(options.space.dimension) + REFINEMENT * ladders
+        rounds = budget(options.space.dimension, options.search) + REFINEMENT * ladders
         options = replace(options, evaluations=rounds)
     return Choice(options, words, tuple(errors))
 
@@ -76,9 +77,10 @@ def may_lock(space: ParameterSpace) -> bool:
     return 'bending_friction' in space.free and LOCKING not in space.free and not space.fixed.get(LOCKING)
 
 
-def budget(dimension: int) -> int:
-    """Return the default budget of a search: its largest number of evaluations."""
-    return max(PAPER_ROUNDS, LINEARISATIONS * (dimension + 1))  # one linearisation takes d + 1
+def budget(dimension: int, search: str = '') -> int:
+    """Return the default budget of a search from all over the scales: its largest number of evaluations."""
+    rounds = max(PAPER_ROUNDS, LINEARISATIONS * (dimension + 1))  # one linearisation takes d + 1
+    return rounds + VALLEYS * (search == LeastSquares.name)
 
 
 def _parameters(trials: Sequence[Trial], options: Options) -> tuple[tuple[str, ...], str]:

@@ -36,6 +36,7 @@ class Fit:
     :param parts: how the numbers of parts and knots were chosen, in words; empty if they were given.
     :param model: linear model of the residuals at the best evaluation; None if the search made none.
     :param validated: number of parameter sets simulated to choose the numbers of parts and knots.
+    :param rivals: observations that may fit as well as the best evaluation.
     """
 
     space: ParameterSpace
@@ -48,6 +49,7 @@ class Fit:
     parts: str = ''
     model: Linearisation | None = None
     validated: int = 0
+    rivals: tuple[Observation, ...] = ()
 
     @property
     def stop_reason(self) -> str:
@@ -65,7 +67,7 @@ class Fit:
         here, there = self.best.residuals, other.best.residuals
         better = there is not None and (here is None or costs_less(there, here))
         return replace(other if better else self, evaluations=self.evaluations + other.evaluations,
-                       stopped=other.stopped, validated=self.validated)
+                       stopped=other.stopped, validated=self.validated, rivals=self.rivals + other.rivals)
 
 
 
@@ -105,7 +107,8 @@ def fit(setting: Setting, space: ParameterSpace, search: Search, budget: int, fi
     ended = search.stop_reason or (
         f'budget of {most} evaluations spent' if spent >= most else
         f'{spent} of at most {most} evaluations made, as many as this search may take')
-    return Fit(space, search.name, best, tuple(evaluations), ended, stopped, model=search.model)
+    return Fit(space, search.name, best, tuple(evaluations), ended, stopped, model=search.model,
+               rivals=search.rivals)
 
 
 def _better(best: Evaluation | None, batch: list[Evaluation], search: Search) -> Evaluation | None:

@@ -242,8 +242,8 @@ class Options(DeclaredOptions):
     search: str = declared('least_squares', 'method that chooses the parameter sets to try',
                            choices=tuple(SEARCHES), of=SEARCH)
     evaluations: int = declared(
-        0, "largest number of parameter sets to try (the paper's rounds); 0: 150, or more if there are many "
-        'parameters to find', minimum=0, maximum=1000000, of=SEARCH)
+        0, "largest number of parameter sets to try (the paper's rounds); 0: 150, or 250 with search "
+        'least_squares, or more if there are many parameters to find', minimum=0, maximum=1000000, of=SEARCH)
     seed: int = declared(1, 'random seed; the same seed gives the same result', minimum=0, maximum=2**31 - 1,
                          of=SEARCH)
     engine: str = declared(

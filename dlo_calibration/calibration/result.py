@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 import math
-from typing import Any, Mapping, Sequence
+from typing import Any, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -43,6 +43,7 @@ NOT_USABLE = 'the result is not usable'  # note of its parameters
 #: Bending stiffness over weight and squared length of a DLO that hangs limp, and of one that hardly sags.
 LIMP, RIGID = 0.01, 10.0
 WORST = 0.1  # of the length; good models of real DLOs miss the measured points by 0.3 to 3 % of it
+COARSE = 0.01  # of the length: a finer simulation that moves a trial by more leads it elsewhere
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,8 @@ class CalibrationResult:
                        **hand_estimates(setting)},
             chains=simulated_chains(trials, best), evaluations=fit.evaluations, seconds=0.0,
             search=fit.search, engine=setting.simulator.name, stop_reason=fit.stop_reason,
-            seed=setting.options.seed, warnings=_warnings(best, fit.evaluations), examination=examination,
+            seed=setting.options.seed, examination=examination,
+            warnings=(*_warnings(best, fit.evaluations), *_coarse(trials, examination)),
             hand_error=setting.hand_error)
 
     @property
@@ -438,6 +440,16 @@ def _warnings(best: Evaluation, evaluations: Sequence[Evaluation]) -> tuple[str,
         warnings.append(f'{len(failed)} of {len(evaluations)} evaluations could not be simulated: '
                         f'{failed[0].failure}')
     return tuple(warnings)
+
+
+def _coarse(trials: Sequence[Trial], examination: Examination | None) -> Iterator[str]:
+    """Yield a sentence for each trial that a finer simulation leads elsewhere."""
+    moves = () if examination is None else examination.coarse
+    for k, (trial, moved) in enumerate(zip(trials, moves, strict=False), 1):
+        if moved > COARSE * trial.initial.length:
+            yield (f'{trial.name}: half the time step and twice the nodes move it by {measured(moved, "m")}, '
+                   'so it tells little; does the DLO snap? Let go of it where it is hardly bent, move it '
+                   f'more slowly, or leave it out (--without {k})')
 
 
 def plain(result: CalibrationResult) -> dict[str, Any]:

@@ -38,7 +38,7 @@ from dlo_calibration.inference.examination import (
 from dlo_calibration.inference.missing_parameters import missing_parameters
 from dlo_calibration.inference.outlier import candidate, is_outlier, Outlier, spread_without
 from dlo_calibration.inference.slices import simulate_slices, Slices
-from dlo_calibration.inference.uncertainty import Uncertainty
+from dlo_calibration.inference.uncertainty import DEVIATIONS, Uncertainty
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import BY_NAME, ParameterSpace, REST_SHAPE
 from dlo_calibration.model.score import observed
@@ -105,7 +105,7 @@ def _examined(setting: Setting, fit: Fit, discretised: bool) -> tuple[Examinatio
     finally:
         if finer is not None:
             finer.simulator.close()
-    uncertainty, jacobian = examination.uncertainty, examination.jacobian
+    uncertainty, jacobian = _with_rivals(examination.uncertainty, fit), examination.jacobian
     point, again = np.where(uncertainty.excited, best.point, default), best
     if not np.array_equal(point, best.point):
         model = Linearisation(best.point, best.residuals, jacobian, space.upper).at(point)
@@ -126,6 +126,24 @@ def _examined(setting: Setting, fit: Fit, discretised: bool) -> tuple[Examinatio
     remaining = _step(Linearisation(again.point, again.residuals, jacobian, space.upper),
                       examination.uncertainty)
     return replace(examination, uncertainty=uncertainty.at(best.point, again.point, remaining)), again
+
+
+def _with_rivals(uncertainty: Uncertainty, fit: Fit) -> Uncertainty:
+    """
+    Return the uncertainty whose intervals contain every simulated point that fits as well as the best one.
+
+    Where a valley has several minima, the linear model knows the best one alone.  A point whose cost exceeds
+    the lowest by less than the chi-square of an interval lies in the intervals of the profile likelihood
+    (Venzon and Moolgavkar, A Method for Computing Profile-Likelihood-Based Confidence Intervals, 1988).
+    """
+    assert fit.best.residuals is not None
+    loss = Huber.of(fit.best.residuals)
+    most = loss.cost(fit.best.residuals) + DEVIATIONS**2 / 2 * uncertainty.scale**2
+    points = np.array([fit.best.point, *(
+        rival.point for rival in fit.rivals if loss.cost(rival.residuals) < most)])
+    points = np.where(uncertainty.excited, points, fit.best.point)
+    return uncertainty.within(np.minimum(uncertainty.lower, points.min(axis=0)),
+                              np.maximum(uncertainty.upper, points.max(axis=0)))
 
 
 def _with_hand(space: ParameterSpace, setting: Setting, name: str) -> ParameterSpace:

@@ -61,6 +61,8 @@ class Examination:
     :param cross_validated: mean point error of trials that were left out of the fit [m]; nan with one trial.
     :param default_error: mean point error of the default parameters [m]; nan if they cannot be simulated.
     :param evaluations: number of parameter sets that were simulated.
+    :param coarse: (T,) how far a finer simulation moves the points of each trial on average [m], at the goal
+        where that is most; empty: unknown.
     """
 
     uncertainty: Uncertainty
@@ -70,6 +72,7 @@ class Examination:
     cross_validated: float
     default_error: float
     evaluations: int
+    coarse: tuple[float, ...] = ()
 
     @property
     def noise_alone(self) -> bool:
@@ -108,11 +111,15 @@ def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: 
     fading = np.ones(len(point), bool) if fading is None else fading
     fit = _linearised(point, residuals, layout, residuals_at, noise, fading, upper)
     fold_errors = left_out_errors(fit, layout, residuals_at)
-    shift = None
+    shift: Floats | None = None
+    coarse: tuple[float, ...] = ()
     if finer is not None:
         count += 1
         fine, = finer()
         shift = np.ones(len(point)) if fine is None else optimum_shift(fit, fine)
+        coarse = () if fine is None else tuple(
+            float(np.nanmax(np.nanmean(np.linalg.norm(moved, axis=2), axis=1)))
+            for moved in layout.chains(fine - residuals))
     drawn = [residuals for start in starts for residuals in start()]
     count += len(drawn)
     others, slowly = ([residuals for each in pending for residuals in each()] for pending in (hands, slow))
@@ -131,7 +138,7 @@ def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: 
         regular=_converged(fit, uncertainty),
         cross_validated=float(np.concatenate(fold_errors).mean()) if fold_errors else float('nan'),
         default_error=float('nan') if at_default is None else PointErrors.of(layout.points(at_default)).mean,
-        evaluations=count)
+        evaluations=count, coarse=coarse)
 
 
 def _linearised(point: Floats, residuals: Floats, layout: ResidualLayout, residuals_at: Evaluate,

@@ -18,6 +18,9 @@ from dlo_calibration.search.protocol import Observation
 
 #: Largest distance, in each parameter, at which a Jacobian is still valid and two minima count as the same.
 NEAR = 0.03
+#: How far points along a valley are on both sides: basins of stick and slip are 0.03 to 0.1 wide.
+ALONG = np.concatenate([np.arange(0.02, 0.11, 0.02), np.arange(0.12, 0.38, 0.04)])
+MIXED = 0.2  # second largest component of the direction of a valley, at least
 STEEP = 1e-12  # share of the largest possible slope that counts as none
 
 
@@ -158,6 +161,21 @@ class Descent:
             share = min(1.0, radius / max(float(np.abs(step).max()), TINY))
             steps.append(np.clip(self.point + share * step, 0.0, self.upper) - self.point)
         return steps
+
+    def valley(self) -> Floats:
+        """
+        Return points (n, d), on both sides, along the valley in which parameters make up for each other.
+
+        It is the flattest principal axis of the model that changes two parameters or more; without, n is 0.
+        """
+        columns = np.flatnonzero(self.visible())
+        model = self.model.columns(columns).weighted(self.loss.roots(self.residuals))
+        for axis in np.linalg.eigh(model.information)[1].T:
+            if len(axis) > 1 and np.sort(np.abs(axis))[-2] > MIXED:
+                points = np.tile(self.point, (2 * len(ALONG), 1))
+                points[:, columns] += np.concatenate([-ALONG, ALONG])[:, None] * axis
+                return points[((points >= 0.0) & (points <= self.upper)).all(axis=1)]
+        return np.zeros((0, len(self.point)))
 
     def predicted(self, step: Floats) -> float:
         """Return the cost [m^2] that the model predicts after a (d,) step."""

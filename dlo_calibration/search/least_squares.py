@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from operator import itemgetter
 from typing import Sequence
 
 import numpy as np
@@ -28,6 +29,10 @@ SCAN_RADIUS = 0.1  # of a step from a scanned point; points nearer than this to 
 MOST_ITERATIONS = 25  # of one descent
 STALLED = 0.02  # share of the cost; a descent had stalled before its minimum if polishing saves more
 MOST_RESUMED = 4  # times that a polished descent continues
+MOST_VALLEYS = 3  # times that a lower minimum is sought along a valley
+PROMISING, MOST_PROMISING = 1.2, 8  # most predicted cost of a place beside it, and number of such places
+LOWER = 0.98  # cost of a place that is worth another descent
+RIVAL = 1.1  # cost up to which a point may fit as well as the lowest
 CONFIRMED = 2  # independent descents that end in a minimum, or find none lower, confirm it
 
 
@@ -59,6 +64,20 @@ class LeastSquares(Search):
         # one measured, as contacts that come and go make columns too large, never too small.
         self._least_effect = np.full(dimension, np.inf)
         self._descents: list[Descent] = []
+        self._rivals: list[Observation] = []
+
+    def tell(self, observations: Sequence[Observation]) -> None:
+        """Take the results of the last `ask`; remember those that cost little."""
+        super().tell(observations)
+        if self._lowest is not None and self._lowest.residuals is not None:
+            loss = Huber.of(self._lowest.residuals)
+            most = RIVAL * loss.cost(self._lowest.residuals)
+            self._rivals = [one for one in (*self._rivals, *observations) if loss.cost(one.residuals) <= most]
+
+    @property
+    def rivals(self) -> tuple[Observation, ...]:
+        """The points that cost up to `RIVAL` times as much as the lowest, and it."""
+        return tuple(self._rivals)
 
     @property
     def model(self) -> Linearisation | None:
@@ -90,6 +109,8 @@ class LeastSquares(Search):
         if self._hints.jacobian is None:
             polished = yield from self._finish(best)
             best, reached = polished, reached if self._same_minimum(polished, best) else 1
+        if not self._hints.refines:
+            best, reached = yield from self._follow_valley(best, reached)
         return best.ended + (f'; reached from {reached} starts' if reached > 1 else '')
 
     def _confirm(self, best: Descent, starts: list[Observation]) -> Batches[tuple[Descent, int]]:
@@ -175,6 +196,44 @@ class LeastSquares(Search):
             here.move(best)
         return here
 
+    def _follow_valley(self, best: Descent, reached: int) -> Batches[tuple[Descent, int]]:
+        """
+        Look for a lower minimum along the valley in which parameters make up for each other.
+
+        A DLO that sticks and slips makes such a valley rough: it has many minima, in which descents from all
+        start points may end far from the lowest one.
+
+        :returns: the descent that ended in the lowest, and the number of start points that led there.
+        """
+        for _ in range(MOST_VALLEYS):
+            points = best.valley()
+            if not len(points):
+                break
+            beside = yield points
+            led = []
+            for observation in beside:
+                if observation.residuals is not None:
+                    there = self._from(observation, best)
+                    step = there.step(SCAN_RADIUS)
+                    led.append((there.predicted(step), there.point + step))
+            led = sorted((pair for pair in led if pair[0] < PROMISING * best.cost), key=itemgetter(0))
+            tried = (yield np.clip([point for _, point in led[:MOST_PROMISING]], 0.0, self._upper)
+                     ) if led else ()
+            lowest = min((*beside, *tried), key=lambda observation: best.loss.cost(observation.residuals))
+            if best.loss.cost(lowest.residuals) > LOWER * best.cost:
+                break
+            descent = yield from self._descend(self._from(lowest, best), best, ())
+            if not costs_less(descent.residuals, best.residuals):
+                break
+            best, reached = (yield from self._finish((yield from self._end(descent)))), 1
+        return best, reached
+
+    def _from(self, observation: Observation, near: Descent) -> Descent:
+        """Return a descent that begins at an observation, with the slopes of one nearby."""
+        assert observation.residuals is not None
+        return Descent(observation.point, observation.residuals, near.loss, near.jacobian, NEAR,
+                       origin=near.origin, upper=self._upper)
+
     def _begin(self, start: Observation) -> Descent:
         assert start.residuals is not None
         begun = Descent(start.point, start.residuals, Huber.of(start.residuals),
@@ -204,8 +263,7 @@ class LeastSquares(Search):
         lowest, best = (1 - 0.02) * here.cost, None
         for observation in observations:
             if observation.residuals is not None:
-                there = Descent(observation.point, observation.residuals, here.loss, here.jacobian, NEAR,
-                                origin=here.origin, upper=self._upper)
+                there = self._from(observation, here)
                 predicted = min(there.predicted(there.step(SCAN_RADIUS)), there.cost)
                 if predicted < lowest:
                     lowest, best = predicted, there

@@ -154,3 +154,8 @@ class Search:
     def model(self) -> Linearisation | None:
         """Linear model of the residuals at `best`; None if the method has not made one."""
         return None
+
+    @property
+    def rivals(self) -> tuple[Observation, ...]:
+        """Observations that may fit as well as `best`; empty if the method does not keep them."""
+        return ()

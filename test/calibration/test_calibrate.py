@@ -146,6 +146,7 @@ def test_a_search_that_ends_early_says_why():
         name = 'finished'
         limit = float('inf')
         best = model = None
+        rivals = ()
         stop_reason = 'it cannot get better'
 
         def __init__(self):

@@ -20,6 +20,7 @@ from dlo_calibration.calibration.choice import (
     may_lock,
     PAPER_ROUNDS,
     REFINEMENT,
+    VALLEYS,
 )
 from dlo_calibration.calibration.engines import make_simulator
 from dlo_calibration.experiment.study import Observed
@@ -55,7 +56,7 @@ def test_trials_at_rest_give_the_papers_four_and_the_same_result():
     trials, options = toy_trials(2), Options(workers=1)
     choice = choose(trials, options)
     assert (choice.options.calibrate, choice.options.evaluations) == (
-        PAPER_PARAMETERS, PAPER_ROUNDS + REFINEMENT)
+        PAPER_PARAMETERS, PAPER_ROUNDS + VALLEYS + REFINEMENT)
     assert choice.words == ('Calibrated: flexibility, elasticity, friction, self_collision; '
                             'not damping, internal_damping, because no goal was seen in motion.')
     auto, named = (calibrate(trials, replace(each, evaluations=20), make_simulator=new_toy)
@@ -97,17 +98,18 @@ def test_more_parameters_get_more_evaluations():
     def most(**given):
         return choose(toy_trials(2), Options(**given)).options.evaluations
 
-    assert most(parts=1) == most(calibrate='friction') == most(parts=2) == 150
-    assert most(parts=8) > 150
+    assert most(parts=1) == most(calibrate='friction') == most(parts=2) == 250
+    assert most(parts=8) > 250
     assert most() > most(parts=8)
-    assert most(search='random') == most(search='cma_es') == 150  # only least squares goes on to parts
+    assert most(search='random') == most(search='cma_es') == 150
 
 
 def test_only_a_dlo_of_strands_may_lock():
     assert not may_lock(choose(toy_trials(2), Options()).options.space)
     trials = [stream(), replace(stream(), name='again')]
     choice = choose(trials, Options()).options
-    assert may_lock(choice.space) and choice.evaluations == PAPER_ROUNDS + 2 * REFINEMENT
+    assert may_lock(choice.space) and choice.evaluations == (
+        PAPER_ROUNDS + VALLEYS + 2 * REFINEMENT)
     for locking in ({'calibrate': (*ALL, 'locking')}, {'calibrate': ALL, 'locking': 30.0}):
         assert not may_lock(Options.of(locking).space)
 
@@ -115,7 +117,7 @@ def test_only_a_dlo_of_strands_may_lock():
 def test_a_log_serves_the_names_that_auto_stands_for():
     trials = toy_trials(2)
     assert calibration_digest(trials, Options()) == calibration_digest(
-        trials, Options(calibrate=PAPER_PARAMETERS, evaluations=PAPER_ROUNDS + REFINEMENT))
+        trials, Options(calibrate=PAPER_PARAMETERS, evaluations=PAPER_ROUNDS + VALLEYS + REFINEMENT))
 
 
 def test_trials_are_appraised_with_the_parameters_that_they_show():

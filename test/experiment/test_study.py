@@ -13,7 +13,7 @@ from toy_messages import toy_trials, TRUTH
 from toy_simulator import ToySimulator
 
 from dlo_calibration.calibration.calibrate import calibrate
-from dlo_calibration.calibration.choice import PAPER_ROUNDS, REFINEMENT
+from dlo_calibration.calibration.choice import PAPER_ROUNDS, REFINEMENT, VALLEYS
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.experiment.journal import Journal
@@ -47,7 +47,7 @@ def task(left_out=None, search='random', seed=1, engine='toy', **about):
 
 
 def test_each_search_has_a_number_of_evaluations_of_its_own():
-    for search, most in (('random', PAPER_ROUNDS), ('least_squares', PAPER_ROUNDS + REFINEMENT)):
+    for search, most in (('random', PAPER_ROUNDS), ('least_squares', PAPER_ROUNDS + VALLEYS + REFINEMENT)):
         for left_out in (None, 0):
             options = task(left_out, search, 7, options=Options()).options
             assert (options.search, options.seed, options.evaluations) == (search, 7, most)
