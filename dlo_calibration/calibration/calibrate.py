@@ -11,7 +11,7 @@ from dataclasses import replace
 import time
 from typing import Callable, Sequence
 
-from dlo_calibration.calibration.choice import budget
+from dlo_calibration.calibration.choice import budget, VALLEYS
 from dlo_calibration.calibration.engines import engine_digest, SimulatorFactory
 from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.calibration.fit import Fit, fit
@@ -34,10 +34,11 @@ from dlo_calibration.evaluation.cluster import ClusterExecutor
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.evaluation.log import EvaluationLog, Memory
 from dlo_calibration.evaluation.pool import Threads
+from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.noise import noise
 from dlo_calibration.observation.plausibility import implausible_trials, observation_warnings
-from dlo_calibration.search import LeastSquares, SEARCHES
+from dlo_calibration.search import Hints, LeastSquares, SEARCHES
 
 AGAIN = 10  # evaluations for each parameter that must be left for another search
 
@@ -121,8 +122,8 @@ def searched(setting: Setting, prior: Prior) -> Fit:
     """
     Find the best parameter set with the chosen search, and the number of parts if that is open.
 
-    Least squares searches again while noise does not explain the residuals of an even DLO, until it finds
-    nothing better.
+    Least squares goes on with an even DLO until it finds nothing better: along the valley of the minimum, and
+    from other start points while noise does not explain the residuals.
 
     :raises SimulationError: if no evaluation could be simulated.
     """
@@ -130,29 +131,41 @@ def searched(setting: Setting, prior: Prior) -> Fit:
     search = SEARCHES[options.search](space.dimension, options.seed, prior.hints)
     if options.search != LeastSquares.name:
         return fit(setting, space, search, options.evaluations)
-    most = budget(space.dimension, options.search) if refines else options.evaluations
+    most = budget(space.dimension) if refines else options.evaluations
     best = fit(setting, space, search, min(most, options.evaluations))
     while True:
-        best = refine(setting, best, options.evaluations) if refines else best
-        other = _other_search(setting, prior, best) if best.space == space else None
-        best, former = best if other is None else best.with_search(other), best
-        if best.best is former.best:
+        best, former = refine(setting, best, options.evaluations) if refines else best, best
+        for go_on in (_along_valley, _other_search):
+            if best.space == space and (other := go_on(setting, prior, best)) is not None:
+                best = best.with_search(other)
+        if best.space != space or best.best is former.best:
             return best
 
 
-def _other_search(setting: Setting, prior: Prior, best: Fit) -> Fit | None:
-    """
-    Search from other start points; None: noise explains the residuals, or no search is possible.
+def _along_valley(setting: Setting, prior: Prior, best: Fit) -> Fit | None:
+    """Search along the valley of a minimum; None: no search is possible."""
+    space, spent = best.space, len(best.evaluations)
+    left = min(VALLEYS, setting.options.evaluations - spent)
+    if best.stopped or setting.should_stop() or left <= 0 or best.model is None:
+        return None
+    hints = replace(Hints.at(best.best.point, best.model.jacobian, upper=space.upper), follows_valley=True)
+    return _another(setting, space, hints, left, spent)
 
-    In a narrow, curved valley, as of flexibility and friction, a search may end far from the minimum.
-    """
-    options, space, spent = setting.options, prior.space, len(best.evaluations)
-    left = min(budget(space.dimension, options.search), options.evaluations - spent)
+
+def _other_search(setting: Setting, prior: Prior, best: Fit) -> Fit | None:
+    """Search from other start points; None: noise explains the residuals, or no search is possible."""
+    options, space, spent = setting.options, best.space, len(best.evaluations)
+    left = min(budget(space.dimension), options.evaluations - spent)
     if best.stopped or setting.should_stop() or left < AGAIN * space.dimension or \
             best.explained(noise(setting.trials)):
         return None
-    search = LeastSquares(space.dimension, options.seed + spent, prior.hints)
+    return _another(setting, space, prior.hints, left, spent)
+
+
+def _another(setting: Setting, space: ParameterSpace, hints: Hints, budget: int, spent: int) -> Fit | None:
+    """Return a further search, after `spent` evaluations; None: it has no evaluation that was simulated."""
+    search = LeastSquares(space.dimension, setting.options.seed + spent, hints)
     try:
-        return fit(setting, space, search, left, spent)
+        return fit(setting, space, search, budget, spent)
     except SimulationError:  # stopped at its first evaluation, or none can be simulated
         return None

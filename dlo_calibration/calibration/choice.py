@@ -61,7 +61,8 @@ def choose(trials: Sequence[Trial], options: Options, evidence: GripEvidence | N
             words += f' Corrected: {", ".join(errors)}, because {evidence.words(errors)}.'
     if options.evaluations == 0:
         ladders = chooses_parts(trials, options) * (1 + may_lock(options.space))
-        rounds = budget(options.space.dimension, options.search) + REFINEMENT * ladders
+        rounds = budget(options.space.dimension) + REFINEMENT * ladders
+        rounds += VALLEYS * (options.search == LeastSquares.name)
         options = replace(options, evaluations=rounds)
     return Choice(options, words, tuple(errors))
 
@@ -77,10 +78,9 @@ def may_lock(space: ParameterSpace) -> bool:
     return 'bending_friction' in space.free and LOCKING not in space.free and not space.fixed.get(LOCKING)
 
 
-def budget(dimension: int, search: str = '') -> int:
-    """Return the default budget of a search from all over the scales: its largest number of evaluations."""
-    rounds = max(PAPER_ROUNDS, LINEARISATIONS * (dimension + 1))  # one linearisation takes d + 1
-    return rounds + VALLEYS * (search == LeastSquares.name)
+def budget(dimension: int) -> int:
+    """Return the default budget of a search: its largest number of evaluations."""
+    return max(PAPER_ROUNDS, LINEARISATIONS * (dimension + 1))  # one linearisation takes d + 1
 
 
 def _parameters(trials: Sequence[Trial], options: Options) -> tuple[tuple[str, ...], str]:

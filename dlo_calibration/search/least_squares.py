@@ -30,9 +30,10 @@ MOST_ITERATIONS = 25  # of one descent
 STALLED = 0.02  # share of the cost; a descent had stalled before its minimum if polishing saves more
 MOST_RESUMED = 4  # times that a polished descent continues
 MOST_VALLEYS = 3  # times that a lower minimum is sought along a valley
-PROMISING, MOST_PROMISING = 1.2, 8  # most predicted cost of a place beside it, and number of such places
-LOWER = 0.98  # cost of a place that is worth another descent
-RIVAL = 1.1  # cost up to which a point may fit as well as the lowest
+# Largest costs, in units of that of the minimum: as predicted beside a point of the valley, so that
+# this place is simulated; as simulated, to descend from there; and to fit perhaps as well.
+PROMISING, LOWER, RIVAL = 1.2, 0.98, 1.05
+MOST_PROMISING = 8  # places that are simulated beside the points of a valley
 CONFIRMED = 2  # independent descents that end in a minimum, or find none lower, confirm it
 
 
@@ -76,7 +77,7 @@ class LeastSquares(Search):
 
     @property
     def rivals(self) -> tuple[Observation, ...]:
-        """The points that cost up to `RIVAL` times as much as the lowest, and it."""
+        """The observations that cost up to `RIVAL` times as much as the lowest one, and that one."""
         return tuple(self._rivals)
 
     @property
@@ -109,7 +110,7 @@ class LeastSquares(Search):
         if self._hints.jacobian is None:
             polished = yield from self._finish(best)
             best, reached = polished, reached if self._same_minimum(polished, best) else 1
-        if not self._hints.refines:
+        if self._hints.follows_valley:
             best, reached = yield from self._follow_valley(best, reached)
         return best.ended + (f'; reached from {reached} starts' if reached > 1 else '')
 

@@ -43,6 +43,7 @@ class Hints:
     :param coarse: the search ends where a step gains little, before it has converged.
     :param upper: (d,) upper ends of the box, or one for all; the lower ones are 0.
     :param middle: (d,) of the start points: see `spread`.
+    :param follows_valley: the search looks along the valley in which parameters make up for each other, too.
     """
 
     start: Floats
@@ -52,6 +53,7 @@ class Hints:
     coarse: bool = False
     upper: Ends = 1.0
     middle: Ends = 0.5
+    follows_valley: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'start', frozen_array(self.start))

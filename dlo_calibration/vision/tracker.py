@@ -81,9 +81,12 @@ SHOWN = 0.2  # share of the DLO's area that has its colour in the first image, a
 ADAPTED = 0.05  # share by which what is usual follows each image
 DAMPED = 0.7  # of the velocity that remains
 REDUCED = 4.0  # px, width of the DLO in the picture in which colours are counted
+ALIKE_SHEET = 0.1  # share of a sheet that has it, from which on the DLO cannot be told from the sheet
+COVER = (255, 0, 255)  # red, green, blue
 ALIKE = 0.75  # share of the DLO's usual logarithm of the odds from which on a place there has its colour
 SEARCHES = 10  # images from one search of the whole picture to the next
 ELSEWHERE = 'the DLO is also where the line is not: move it slowly, or start again with new clicks'
+NO_END = "neither end is seen, and the sheet has the DLO's colour: lay it where the DLO does not come"
 WRONG_LENGTH = 0.05  # share of the length by which a line that is found again may differ
 
 
@@ -133,12 +136,12 @@ class Tracker:
     Follows a DLO from image to image, forwards or backwards in time.
 
     :param count: of points along the DLO.
-    :param sheet: corners (k, 2) on the table [m] of a sheet of paper, which is not the DLO though it may have
-        its colour; None: there is none, or no scale.
+    :param sheet: corners (k, 2) on the table [m] of a sheet of paper, which may have the DLO's colour; None:
+        there is none, or no scale.
     """
 
     def __init__(self, count: int = COUNT, sheet: Floats | None = None) -> None:
-        self._count, self._sheet = count, sheet
+        self._count, self._sheet, self._hides = count, sheet, False
 
     def start(self, pixels: Pixels, clicks: ArrayLike, scale: Scale | None = None) -> Tracked:
         """
@@ -166,7 +169,8 @@ class Tracker:
         self._velocity: Floats = np.zeros_like(line)
         self._lost_for = 0
         self._shown = 1.0
-        self._usual, shown = self._unexplained(pixels, line)
+        self._hides = self._like_sheet(pixels)
+        self._usual, shown = self._unexplained(self._without_sheet(pixels), line)
         # Where it is thin or blurred, less than its area has its colour.
         self._shown = max(shown, SHOWN)
         self._usual /= self._shown
@@ -186,6 +190,7 @@ class Tracker:
                 self._line = replace(self._line, line=moved)
         if scale is not None:
             self._scale = scale  # while nothing of the board is seen, the last one is the best guess
+        pixels = self._without_sheet(pixels)
         before = self._line.line
         found = self._followed(pixels, before + self._velocity * elapsed, WIDER if self._lost_for else FAR[0])
         reason = self._doubt(pixels, found)
@@ -196,7 +201,7 @@ class Tracker:
         if reason:
             self._lost_for += 1
             self._velocity = np.zeros_like(before)
-            if reason == ELSEWHERE:  # from there, it may reach the rest in the next image
+            if reason in (ELSEWHERE, NO_END):  # from there, it may reach the rest in the next image
                 self._line = found
             return Tracked(np.full((self._count, 2), np.nan), self._width(), reason)
         if self._lost_for or elapsed <= 0:
@@ -207,6 +212,28 @@ class Tracker:
         self._lost_for = 0
         self._line = found
         return self._tracked()
+
+    def _outline(self) -> NDArray[np.int32] | None:
+        """Return the corners (k, 2) of the sheet [px]; None: it is unknown where it is."""
+        if self._sheet is None or self._scale is None:
+            return None
+        corners = self._scale.to_pixels(np.column_stack([self._sheet, np.zeros(len(self._sheet))]))
+        return np.rint(corners).astype(np.int32) if np.isfinite(corners).all() else None
+
+    def _like_sheet(self, pixels: Pixels) -> bool:
+        """Tell whether much of the sheet has the DLO's colour."""
+        outline, (mask, factor) = self._outline(), self._mask(pixels)
+        if outline is None:
+            return False
+        paper = cv2.fillPoly(np.zeros(mask.shape, np.uint8), [outline // factor], 1) > 0
+        return bool(paper.any() and mask[paper].mean() > ALIKE_SHEET)
+
+    def _without_sheet(self, pixels: Pixels) -> Pixels:
+        """Return an image in which a sheet of the DLO's colour is covered by a colour that nothing has."""
+        outline = self._outline() if self._hides else None
+        if outline is None:
+            return pixels
+        return np.asarray(cv2.fillPoly(pixels.copy(), [outline], COVER), np.uint8)
 
     def _tracked(self) -> Tracked:
         place = np.linspace(0, len(self._line.line) - 1, self._count)
@@ -412,6 +439,8 @@ class Tracker:
             return 'the DLO has left the picture: show it again'
         if found.seen.mean() < LEAST:
             return 'too little of the DLO is seen: take hands out of the way, and move it slowly'
+        if self._hides and not any(found.ends):
+            return NO_END
         unexplained, _ = self._unexplained(pixels, found.line)
         if unexplained > self._usual + UNEXPLAINED:
             return ELSEWHERE
@@ -426,14 +455,7 @@ class Tracker:
                                 cv2.COLOR_RGB2Lab)
         # A mixture of colours, as of skin, has some pixels of the DLO's colour; the DLO has no others.
         side = max(2, round(0.6 * self._width() / factor))
-        mask = np.asarray(cv2.blur(odds(self._table, lab), (side, side)) > self._alike)
-        if self._sheet is not None and self._scale is not None:
-            corners = np.column_stack([self._sheet, np.zeros(len(self._sheet))])
-            outline = self._scale.to_pixels(corners) / factor
-            if np.isfinite(outline).all():
-                paper = cv2.fillPoly(np.zeros(mask.shape, np.uint8), [np.rint(outline).astype(np.int32)], 1)
-                mask = mask & (paper == 0)
-        return mask, factor
+        return np.asarray(cv2.blur(odds(self._table, lab), (side, side)) > self._alike), factor
 
     def _unexplained(self, pixels: Pixels, line: Floats) -> tuple[float, float]:
         """Return the areas with the DLO's colour elsewhere and at the line, as shares of the usual one."""

@@ -97,7 +97,7 @@ def test_the_json_document_is_the_file_and_has_the_recovered_truth(run, session,
     assert code == 0
     assert printed == json.loads((tmp_path / 'out' / 'experiment.json').read_text())
     assert printed['complete']
-    assert printed['evaluations'] == {'least_squares': 150 + 400}
+    assert printed['evaluations'] == {'least_squares': 150 + 100 + 400}
     finding, = printed['findings']
     means = {name: spread['mean'] for name, spread in finding['parameters'].items()}
     assert means == pytest.approx(TRUTH, abs=0.5)

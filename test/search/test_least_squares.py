@@ -62,7 +62,7 @@ def test_it_converges_in_few_evaluations_to_one_point_from_any_seed(roughness):
         counts.append(len(asked))
     assert np.ptp(best, axis=0).max() < 0.003
     assert np.mean(best, axis=0) == pytest.approx(TRUTH, abs=0.003)
-    assert np.median(counts) < 80  # of which 24 look along the valley
+    assert np.median(counts) < 45
 
 
 def kinked(point):
@@ -89,7 +89,9 @@ def test_the_lowest_of_many_minima_along_a_valley_is_found_from_nine_of_ten_seed
         return lean * ratio + along * slips + 0.06 * side * away + 1e-3 * scatter
 
     least = min(float(np.square(rough((0.6 - y / 2, y))).sum()) for y in np.linspace(0.0, 1.0, 1001))
-    costs = [float(np.square(rough(solve(rough, seed, dimension=2)[0].best)).sum()) for seed in range(10)]
+    hints = replace(Hints.none(2), follows_valley=True)
+    costs = [float(np.square(rough(solve(rough, seed, dimension=2, hints=hints)[0].best)).sum())
+             for seed in range(10)]
     assert sorted(costs)[8] < 1.3 * least, costs  # a step of the scan may pass over one
 
 
