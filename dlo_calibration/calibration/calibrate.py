@@ -122,8 +122,8 @@ def searched(setting: Setting, prior: Prior) -> Fit:
     """
     Find the best parameter set with the chosen search, and the number of parts if that is open.
 
-    Least squares goes on with an even DLO until it finds nothing better: along the valley of the minimum, and
-    from other start points while noise does not explain the residuals.
+    Least squares goes on with an even DLO until it finds nothing clearly better: along the valley of the
+    minimum, and from other start points while noise does not explain the residuals.
 
     :raises SimulationError: if no evaluation could be simulated.
     """
@@ -138,7 +138,7 @@ def searched(setting: Setting, prior: Prior) -> Fit:
         for go_on in (_along_valley, _other_search):
             if best.space == space and (other := go_on(setting, prior, best)) is not None:
                 best = best.with_search(other)
-        if best.space != space or best.best is former.best:
+        if best.space != space or not best.clearly_better(former):
             return best
 
 

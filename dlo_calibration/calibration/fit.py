@@ -20,6 +20,8 @@ from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.search import Observation, Search
 from dlo_calibration.search.least_squares import costs_less
 
+CLEARLY = 0.02  # share of the cost; less is not worth another search
+
 
 @dataclass(frozen=True)
 class Fit:
@@ -69,6 +71,13 @@ class Fit:
         return replace(other if better else self, evaluations=self.evaluations + other.evaluations,
                        stopped=other.stopped, validated=self.validated, rivals=self.rivals + other.rivals)
 
+    def clearly_better(self, other: Fit) -> bool:
+        """Tell whether this fit costs less than another one of the same space, by more than `CLEARLY`."""
+        here, there = self.best.residuals, other.best.residuals
+        if here is None or there is None:
+            return there is None and here is not None
+        loss = min(Huber.of(here), Huber.of(there))
+        return loss.cost(here) < (1 - CLEARLY) * loss.cost(there)
 
 
 def fit(setting: Setting, space: ParameterSpace, search: Search, budget: int, first: int = 0) -> Fit:
