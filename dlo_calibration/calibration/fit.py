@@ -69,7 +69,8 @@ class Fit:
         here, there = self.best.residuals, other.best.residuals
         better = there is not None and (here is None or costs_less(there, here))
         return replace(other if better else self, evaluations=self.evaluations + other.evaluations,
-                       stopped=other.stopped, validated=self.validated, rivals=self.rivals + other.rivals)
+                       stopped=other.stopped, parts=self.parts, validated=self.validated,
+                       rivals=self.rivals + other.rivals)
 
     def clearly_better(self, other: Fit) -> bool:
         """Tell whether this fit costs less than another one of the same space, by more than `CLEARLY`."""
