@@ -7,8 +7,8 @@ Calibrate ropes from trials among two pegs, whose truth is known.
     python benchmark/pegs.py
 
 The trials are simulated with finer nodes and steps, and seen with noise.  Hands hold the rope until it rests
-with little bending at the pegs: a stiff rope that is bent around one and let go snaps back, and lands where
-only the finest steps agree, which `fit` says of such trials.
+with little bending at the pegs: a stiff rope that is bent around one and let go snaps back, and where it
+lands depends on nodes and steps, which `fit` says of such trials.
 
 It takes two minutes.  The table is printed, and written to benchmark/results/pegs.md.
 """

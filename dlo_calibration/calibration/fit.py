@@ -18,9 +18,7 @@ from dlo_calibration.inference.examination import Examination
 from dlo_calibration.inference.uncertainty import noise_alone
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.search import Observation, Search
-from dlo_calibration.search.least_squares import costs_less
-
-CLEARLY = 0.02  # share of the cost; less is not worth another search
+from dlo_calibration.search.least_squares import costs_less, LOWER
 
 
 @dataclass(frozen=True)
@@ -73,12 +71,9 @@ class Fit:
                        rivals=self.rivals + other.rivals)
 
     def clearly_better(self, other: Fit) -> bool:
-        """Tell whether this fit costs less than another one of the same space, by more than `CLEARLY`."""
+        """Tell whether this fit costs so much less than another one of the same space that a search pays."""
         here, there = self.best.residuals, other.best.residuals
-        if here is None or there is None:
-            return there is None and here is not None
-        loss = min(Huber.of(here), Huber.of(there))
-        return loss.cost(here) < (1 - CLEARLY) * loss.cost(there)
+        return here is not None and (there is None or costs_less(here, there, LOWER))
 
 
 def fit(setting: Setting, space: ParameterSpace, search: Search, budget: int, first: int = 0) -> Fit:

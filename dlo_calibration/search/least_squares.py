@@ -37,10 +37,10 @@ MOST_PROMISING = 8  # places that are simulated beside the points of a valley
 CONFIRMED = 2  # independent descents that end in a minimum, or find none lower, confirm it
 
 
-def costs_less(residuals: Floats, others: Floats) -> bool:
-    """Tell whether residuals [m] cost less than others, by the narrower of their losses."""
+def costs_less(residuals: Floats, others: Floats, share: float = 1.0) -> bool:
+    """Tell whether residuals [m] cost less than a share of others, by the narrower of their losses."""
     loss = min(Huber.of(residuals), Huber.of(others))
-    return loss.cost(residuals) < loss.cost(others)
+    return loss.cost(residuals) < share * loss.cost(others)
 
 
 class LeastSquares(Search):
@@ -226,7 +226,8 @@ class LeastSquares(Search):
             descent = yield from self._descend(self._from(lowest, best), best, ())
             if not costs_less(descent.residuals, best.residuals):
                 break
-            best, reached = (yield from self._finish((yield from self._end(descent)))), 1
+            descent = yield from self._end(descent)
+            best, reached = (yield from self._finish(descent)), 1
         return best, reached
 
     def _from(self, observation: Observation, near: Descent) -> Descent:
@@ -261,7 +262,7 @@ class LeastSquares(Search):
         points = np.tile(here.point, (len(values), 1))
         points[:, weakest] = values
         observations = yield points
-        lowest, best = (1 - 0.02) * here.cost, None
+        lowest, best = LOWER * here.cost, None
         for observation in observations:
             if observation.residuals is not None:
                 there = self._from(observation, here)

@@ -81,9 +81,9 @@ SHOWN = 0.2  # share of the DLO's area that has its colour in the first image, a
 ADAPTED = 0.05  # share by which what is usual follows each image
 DAMPED = 0.7  # of the velocity that remains
 REDUCED = 4.0  # px, width of the DLO in the picture in which colours are counted
-ALIKE_SHEET = 0.1  # share of a sheet that has it, from which on the DLO cannot be told from the sheet
-COVER = (255, 0, 255)  # red, green, blue
 ALIKE = 0.75  # share of the DLO's usual logarithm of the odds from which on a place there has its colour
+SHEET_ALIKE = 0.1  # share of the sheet that has the DLO's colour, from which on it hides the DLO
+COVER = (255, 0, 255)  # red, green, blue of such a sheet in the image that is searched
 SEARCHES = 10  # images from one search of the whole picture to the next
 ELSEWHERE = 'the DLO is also where the line is not: move it slowly, or start again with new clicks'
 NO_END = "neither end is seen, and the sheet has the DLO's colour: lay it where the DLO does not come"
@@ -221,12 +221,12 @@ class Tracker:
         return np.rint(corners).astype(np.int32) if np.isfinite(corners).all() else None
 
     def _like_sheet(self, pixels: Pixels) -> bool:
-        """Tell whether much of the sheet has the DLO's colour."""
+        """Tell whether so much of the sheet has the DLO's colour that it hides the DLO."""
         outline, (mask, factor) = self._outline(), self._mask(pixels)
         if outline is None:
             return False
         paper = cv2.fillPoly(np.zeros(mask.shape, np.uint8), [outline // factor], 1) > 0
-        return bool(paper.any() and mask[paper].mean() > ALIKE_SHEET)
+        return bool(paper.any() and mask[paper].mean() > SHEET_ALIKE)
 
     def _without_sheet(self, pixels: Pixels) -> Pixels:
         """Return an image in which a sheet of the DLO's colour is covered by a colour that nothing has."""
