@@ -25,6 +25,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.vision.elastic import directions, Evidence, fitted
+from dlo_calibration.vision.hold import Hold
 from dlo_calibration.vision.middle_line import (
     along_line,
     arc_lengths,
@@ -61,6 +62,8 @@ KEPT = 0.9  # share of the bends that the line keeps from image to image where t
 FREE = (10.0, 1.5)  # half widths, deviation from where the line is expected: if an end is seen, or none
 STILL = 0.02  # the same along a part that does not move, while another part is in the air
 END = 0.1  # half widths, standard deviation of an end
+HIDDEN = 0.1  # of the weight of the place that is seen best, below which one is hidden
+SHORTEST = 0.4  # share by which a segment in the air can look shorter
 MOVES = 0.12  # half widths from image to image, from which on a part moves
 TOLERANCE = 0.006  # share of the length on a table that a line between two visible ends may lack
 UNSCALED = 0.04  # the same in a picture without a scale
@@ -73,7 +76,6 @@ OTHERS = 5e-4  # share of each colour, e.g. of 2000 colours of hands: a rare col
 SEEN = 0.35  # mean logarithm of the odds of a colour from which on the DLO is seen
 SIDES = np.array([-2.6, -2.2, -1.8, 1.8, 2.2, 2.6])  # half widths beside the DLO, where the ground is seen
 STRANGE = 16.0  # distance in L, a, b of what is behind an end, from which on it is probably covered
-HELD = 4.0  # difference between both ends in that, from which on a hand seems to hold one of them
 APART = 0.6  # half widths between the line and where the image shows it, from which on it is not seen
 LEAST = 0.3  # share of the line that must be seen
 UNEXPLAINED = 0.06  # of the DLO's area: more of its colour elsewhere than usual is too much
@@ -123,12 +125,14 @@ class _Line:
     :param seen: (n,).
     :param ends: whether both ends are seen.
     :param excess: share of the length by which the line between two visible ends is too long.
+    :param hold: which part a hand seems to hold.
     """
 
     line: Floats
     seen: Bools
     ends: tuple[bool, bool]
     excess: float
+    hold: Hold
 
 
 class Tracker:
@@ -164,8 +168,8 @@ class Tracker:
         self._table = learn_colours(strip, 0.5, (1.4, 2.4), OTHERS)
         middle = straighten(pixels, line, np.full(count, half), np.linspace(-0.4, 0.4, 5))
         self._alike = ALIKE * float(np.median(odds(self._table, middle.lab).mean(axis=1)))
-        self._line = _Line(line, np.interp(np.linspace(0, 1, count), np.linspace(0, 1, len(trace.sure)),
-                                           trace.sure) > 0.5, (True, True), 0.0)
+        sure = np.interp(np.linspace(0, 1, count), np.linspace(0, 1, len(trace.sure)), trace.sure) > 0.5
+        self._line = _Line(line, sure, (True, True), 0.0, Hold.of(line, np.zeros(2)))
         self._velocity: Floats = np.zeros_like(line)
         self._lost_for = 0
         self._shown = 1.0
@@ -185,9 +189,10 @@ class Tracker:
         :param scale: of this image; None: that of the image before.
         """
         if scale is not None and self._scale is not None and scale is not self._scale:
-            moved = scale.to_pixels(self._scale.points(self._line.line))
-            if np.isfinite(moved).all():
-                self._line = replace(self._line, line=moved)
+            line, rested = (scale.to_pixels(self._scale.points(points))
+                            for points in (self._line.line, self._line.hold.rested))
+            if np.isfinite(line).all() and np.isfinite(rested).all():
+                self._line = replace(self._line, line=line, hold=replace(self._line.hold, rested=rested))
         if scale is not None:
             self._scale = scale  # while nothing of the board is seen, the last one is the best guess
         pixels = self._without_sheet(pixels)
@@ -258,7 +263,7 @@ class Tracker:
     def _followed(self, pixels: Pixels, expected: Floats, far: float) -> _Line:
         """Return the line near where it is expected."""
         height, width = pixels.shape[:2]
-        line, count = expected, len(expected)
+        found, line, count = self._line, expected, len(expected)
         measured, quality = line, np.zeros(count)
         for stage, (reach, step, sigma) in enumerate(zip((far, *FAR[1:]), STEPS, SIGMA, strict=True)):
             fineness = self._finenesses(line)
@@ -276,8 +281,9 @@ class Tracker:
             usual = float(np.median(half))
             ends = [self._end(pixels, line[::order], half[::order], measured[::order], quality[::order])
                     for order in (1, -1)]
-            line, accepted, excess = self._elastic(line, measured, quality / (sigma * usual) ** 2, expected,
-                                                   ends, usual, fineness)
+            found = self._elastic(line, measured, quality / (sigma * usual) ** 2, expected, ends, usual,
+                                  fineness)
+            line = found.line
         tangents = directions(line)
         normals = np.column_stack([-tangents[:, 1], tangents[:, 0]])
         apart = np.abs(((line - strip.at(chosen)) * normals).sum(axis=1)) / usual
@@ -290,7 +296,7 @@ class Tracker:
         seen = (colours > SEEN) & (apart < APART) & inside
         # One station alone is a coincidence.
         seen = gaussian_filter1d(seen.astype(float), 1.0, mode='nearest') > 0.5
-        return _Line(line, seen & inside, accepted, excess)
+        return replace(found, seen=seen & inside)
 
     def _places(self, strip: Any, stage: int, line: Floats, half: Floats) -> tuple[NDArray[np.int64], Floats]:
         """Return the offset's index (n,) where the DLO is in a strip, and how sure that is (n,), 0 to 1."""
@@ -384,8 +390,8 @@ class Tracker:
 
     def _elastic(self, line: Floats, measured: Floats, across: Floats, expected: Floats,
                  ends: list[tuple[Floats, float] | None], half: float,
-                 fineness: Floats) -> tuple[Floats, tuple[bool, bool], float]:
-        """Return the elastic line, which of the ends it has, and the excess of its length."""
+                 fineness: Floats) -> _Line:
+        """Return the elastic line; what is seen of it is still that of the last image."""
         count = len(line)
         lengths = self._length / (count - 1) * fineness
         stretch = UNSCALED_STRETCH if self._scale is None else STRETCH
@@ -402,32 +408,39 @@ class Tracker:
         covered = int(np.argmax(strange))
         if all(accepted) and strange[covered] > STRANGE > strange[1 - covered]:
             accepted[covered] = False
-        fit, excess = line, 0.0
+        hold = self._line.hold.behind([None if end is None else end[1] for end in ends])
         while True:
             weights = np.where(accepted, 1.0 / (END * half) ** 2, 0.0)
             if not any(accepted):
                 known = replace(known, along=np.full(count, 1.0 / (FREE[1] * half) ** 2))
             fit = fitted(line, replace(known, ends=places, end_weights=weights))
             if not all(accepted):
-                return fit, (accepted[0], accepted[1]), 0.0
+                return replace(self._line, line=fit, ends=(accepted[0], accepted[1]), excess=0.0, hold=hold)
             excess = float((np.linalg.norm(np.diff(fit, axis=0), axis=1) / fineness).sum() / self._length - 1)
+            hold = hold.seen(fit, places, across > HIDDEN * across.max(), MOVES * half)
             # Behind an end that a hand holds is something else than beside it, and it may be in the air.
-            held = abs(strange[0] - strange[1]) > HELD
-            if (abs(excess) <= tolerance / 4) if held else (excess >= -tolerance):
+            if hold.raises or ((abs(excess) <= tolerance / 4) if hold.held else (excess >= -tolerance)):
                 break
             # What covers an end makes the DLO look shorter, and so does an end that is held in the air; both
             # move.
-            moved = strange if held else np.linalg.norm(places - self._line.line[[0, -1]], axis=1).tolist()
-            accepted[int(np.argmax(moved))] = False
-        if excess > tolerance:
-            # A part in the air looks longer: it is one that moves, or is hidden.
-            normals = np.column_stack([-directions(line)[:, 1], directions(line)[:, 0]])
-            change = np.abs(((fit - self._line.line) * normals).sum(axis=1))
-            loose = (change > MOVES * half) | (across < 0.1 * across.max())
-            moving = gaussian_filter1d(loose.astype(float), 3.0, mode='nearest')
-            still = np.where(moving > 0.05, known.along, 1.0 / (STILL * half) ** 2)
-            fit = fitted(fit, replace(known, along=still, ends=places, end_weights=weights))
-        return fit, (True, True), excess
+            moved = np.linalg.norm(places - self._line.line[[0, -1]], axis=1)
+            accepted[int(np.argmax(hold.strange if hold.held else moved))] = False
+        found = replace(self._line, line=fit, ends=(True, True), excess=excess, hold=hold)
+        if abs(excess) <= tolerance:
+            return replace(found, hold=Hold.of(fit, hold.strange))
+        known = replace(known, ends=places, end_weights=weights)
+        if hold.raises:
+            # A part in the air looks longer, or shorter where it rises towards the hand.
+            share = hold.share(count - 1)
+            looks = np.maximum(excess * share / share.mean(), -SHORTEST)
+            return replace(found, line=fitted(fit, replace(known, lengths=lengths * (1.0 + looks))))
+        # A part in the air looks longer: it is one that moves, or is hidden.
+        normals = np.column_stack([-directions(line)[:, 1], directions(line)[:, 0]])
+        change = np.abs(((fit - self._line.line) * normals).sum(axis=1))
+        loose = (change > MOVES * half) | (across < HIDDEN * across.max())
+        moving = gaussian_filter1d(loose.astype(float), 3.0, mode='nearest')
+        still = np.where(moving > 0.05, known.along, 1.0 / (STILL * half) ** 2)
+        return replace(found, line=fitted(fit, replace(known, along=still)))
 
     def _doubt(self, pixels: Pixels, found: _Line) -> str:
         """Return why a line is none, one sentence; empty: it is one."""
@@ -497,7 +510,7 @@ class Tracker:
         if not abs(arc[-1] / self._length - 1) < 2 * WRONG_LENGTH:
             return None
         line = along_line(smooth, arc, np.linspace(0, arc[-1], count))
-        self._line = _Line(line, np.ones(count, bool), (True, True), 0.0)
+        self._line = _Line(line, np.ones(count, bool), (True, True), 0.0, Hold.of(line, np.zeros(2)))
         found = self._followed(pixels, line, FAR[1])
         if (self._doubt(pixels, found) or found.seen.mean() < 0.8 or not all(found.ends)
                 or abs(found.excess) > WRONG_LENGTH):

@@ -117,6 +117,30 @@ def test_a_hidden_end_does_not_shift_the_points():
     assert np.nanmax(off) < FAR
 
 
+def lifted(height):
+    """Return a DLO (n, 3) [m] whose middle is held so high [m]; both ends slide towards it."""
+    place = np.linspace(-LENGTH / 2, LENGTH / 2, 2001)
+    rise = height * np.square(np.maximum(1.0 - np.square(place / (0.36 * LENGTH)), 0.0))
+    arc = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(place), np.diff(rise)))])
+    arc -= arc[1000]
+    even = np.linspace(-LENGTH / 2, LENGTH / 2, 401)
+    return np.column_stack([np.interp(even, arc, place) + 0.25, np.zeros(401),
+                            np.interp(even, arc, rise) + RADIUS])
+
+
+@pytest.mark.long
+def test_what_stays_on_the_table_is_right_while_the_middle_is_lifted():
+    heights = np.concatenate([np.zeros(4), np.linspace(0.0, 0.1, 20), np.full(2, 0.1)])
+    curves = [lifted(height) for height in heights]
+    hands = [(Hand((0.25, 0.01), -1.5, float(height) + RADIUS),) for height in heights]
+    found = tracked(curves, hands)
+    for one, curve in zip(found, curves, strict=True):
+        on_table = points_of(curve)[:, 2] < RADIUS + 0.001
+        off = errors(one, curve)[on_table]
+        assert np.isfinite(off).sum() >= 2  # an end itself is hardly ever seen
+        assert np.nanmax(off) < FAR
+
+
 def test_a_crossing_keeps_the_order():
     arc = np.linspace(0.0, LENGTH, 401)
     curves = []
