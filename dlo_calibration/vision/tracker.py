@@ -89,6 +89,8 @@ COVER = (255, 0, 255)  # red, green, blue of such a sheet in the image that is s
 SEARCHES = 10  # images from one search of the whole picture to the next
 ELSEWHERE = 'the DLO is also where the line is not: move it slowly, or start again with new clicks'
 NO_END = "neither end is seen, and the sheet has the DLO's colour: lay it where the DLO does not come"
+WHOLE = 0.8  # share of a line that must be seen where all of it was searched
+BRIDGED = 6  # points that tell the direction of a line where it is hidden
 WRONG_LENGTH = 0.05  # share of the length by which a line that is found again may differ
 
 
@@ -199,8 +201,10 @@ class Tracker:
         before = self._line.line
         found = self._followed(pixels, before + self._velocity * elapsed, WIDER if self._lost_for else FAR[0])
         reason = self._doubt(pixels, found)
-        if reason and self._lost_for % SEARCHES == SEARCHES - 1:
-            again = self._searched(pixels)
+        if reason:
+            again = self._rejoined(pixels, found) if reason == ELSEWHERE else None
+            if again is None and self._lost_for % SEARCHES == SEARCHES - 1:
+                again = self._searched(pixels)
             if again is not None:
                 found, reason = again, ''
         if reason:
@@ -472,51 +476,103 @@ class Tracker:
 
     def _unexplained(self, pixels: Pixels, line: Floats) -> tuple[float, float]:
         """Return the areas with the DLO's colour elsewhere and at the line, as shares of the usual one."""
+        elsewhere, own, factor = self._elsewhere(pixels, line)
+        usual = self._shown * max(self._width() * float(arc_lengths(line)[-1]), 1.0) / factor ** 2
+        return np.count_nonzero(elsewhere) / usual, own / usual
+
+    def _elsewhere(self, pixels: Pixels, line: Floats) -> tuple[Bools, int, int]:
+        """Return where else a reduced picture shows the DLO, how much the line does, and the reduction."""
         thick = self._width()
         mask, factor = self._mask(pixels)
         covered = np.zeros(mask.shape, np.uint8)
         points = np.rint(line / factor * 16).astype(np.int32)
         cv2.polylines(covered, [points], False, 1, round(2.5 * thick / factor + 2), cv2.LINE_8, 4)
-        own = float(np.count_nonzero(mask & (covered == 1)))
         elsewhere: Any = (mask & (covered == 0)).astype(np.uint8)
         # What is thicker than the DLO, or not much longer than thick, is another thing, say a hand.
         kernel = np.ones((round(1.7 * thick / factor) + 1,) * 2, np.uint8)
         elsewhere &= 1 - cv2.morphologyEx(elsewhere, cv2.MORPH_OPEN, kernel)
-        _, _, parts, _ = cv2.connectedComponentsWithStats(elsewhere)
-        areas = parts[1:, cv2.CC_STAT_AREA] * float(factor ** 2)
-        usual = self._shown * max(thick * float(arc_lengths(line)[-1]), 1.0)
-        return float(areas[areas > 2.0 * self._shown * thick ** 2].sum()) / usual, own * factor ** 2 / usual
+        _, parts, each, _ = cv2.connectedComponentsWithStats(elsewhere)
+        large = each[:, cv2.CC_STAT_AREA] * float(factor ** 2) > 2.0 * self._shown * thick ** 2
+        large[0] = False
+        return np.asarray(large[parts]), int(np.count_nonzero(mask & (covered == 1))), factor
 
     def _searched(self, pixels: Pixels) -> _Line | None:
         """Return the line found anywhere in the picture; None: there is none that is sure."""
         mask, factor = self._mask(pixels)
-        parts, number = label(mask, np.ones((3, 3)))
-        if not number:
+        rough = _largest_path(mask, factor)
+        if rough is None:
             return None
-        sizes = np.bincount(parts.ravel())[1:]
-        v, u = np.nonzero(parts == int(np.argmax(sizes)) + 1)
-        path = _longest(u, v, mask)
-        if len(path) < 8:
-            return None
-        rough = path * factor
         if np.linalg.norm(rough[0] - self._line.line[0]) + np.linalg.norm(rough[-1] - self._line.line[-1]) > (
                 np.linalg.norm(rough[0] - self._line.line[-1])
                 + np.linalg.norm(rough[-1] - self._line.line[0])):
             rough = rough[::-1]
-        smooth = gaussian_filter1d(evenly(rough, 2.0 * factor), 3.0, axis=0, mode='nearest')
+        return self._checked(pixels, rough, WHOLE)
+
+    def _rejoined(self, pixels: Pixels, found: _Line) -> _Line | None:
+        """Return the line that goes on where its rest comes out of what hides it; None: none is sure."""
+        elsewhere, _, factor = self._elsewhere(pixels, found.line)
+        path = _largest_path(elsewhere, factor)
+        seen = np.flatnonzero(found.seen)
+        for order, end in ((1, 1), (-1, 0)):
+            last = seen[-1] if order == 1 else len(found.line) - 1 - seen[0]
+            if path is None or found.ends[end] or last < BRIDGED:
+                continue
+            line = found.line[::order][:last + 1]
+            # The end of the line is that end of the path which is farther away.
+            if np.linalg.norm(path[0] - line[-1]) > np.linalg.norm(path[-1] - line[-1]):
+                path = path[::-1]
+            rest = self._length - self._long(line) - self._long(path)
+            bridge = self._bridge(line[-BRIDGED:], path[:BRIDGED], rest)
+            if bridge is not None:
+                return self._checked(pixels, np.concatenate([line, bridge, path])[::order], LEAST)
+        return None
+
+    def _long(self, line: Floats) -> float:
+        return float(arc_lengths(line if self._scale is None else self._scale.points(line))[-1])
+
+    def _bridge(self, before: Floats, after: Floats, length: float) -> Floats | None:
+        """Return the smooth curve (n, 2) [px] of a length from one line to another; None: none has it."""
+        share = np.linspace(0.0, 1.0, 22)[1:-1, None]
+        gap = after[0] - before[-1]
+        ways = [(part[-1] - part[0]) / max(float(np.linalg.norm(part[-1] - part[0])), 1e-9)
+                       for part in (before, after)]
+        low, high = 0.0, 3.0
+        for _ in range(20):
+            middle = (low + high) / 2
+            first, second = (middle * float(np.linalg.norm(gap)) * one for one in ways)
+            # Hermite's cubic polynomial.
+            curve = before[-1] + (share ** 2 * (3 - 2 * share)) * gap + (
+                share * (1 - share) ** 2) * first + (share ** 2 * (share - 1)) * second
+            excess = self._long(np.concatenate([before[-1:], curve, after[:1]])) / max(length, 1e-9) - 1
+            low, high = (middle, high) if excess < 0 else (low, middle)
+        return curve if abs(excess) < WRONG_LENGTH else None
+
+    def _checked(self, pixels: Pixels, rough: Floats, least: float) -> _Line | None:
+        """Return the line near a rough one (n, 2) [px], of which so much is seen; None: it is not sure."""
+        smooth = gaussian_filter1d(evenly(rough, self._width() / REDUCED), 3.0, axis=0, mode='nearest')
         kept, count = self._line, len(self._line.line)
-        flat = smooth if self._scale is None else self._scale.points(smooth)
-        arc = arc_lengths(flat)
+        arc = arc_lengths(smooth if self._scale is None else self._scale.points(smooth))
         if not abs(arc[-1] / self._length - 1) < 2 * WRONG_LENGTH:
             return None
         line = along_line(smooth, arc, np.linspace(0, arc[-1], count))
         self._line = _Line(line, np.ones(count, bool), (True, True), 0.0, Hold.of(line, np.zeros(2)))
         found = self._followed(pixels, line, FAR[1])
-        if (self._doubt(pixels, found) or found.seen.mean() < 0.8 or not all(found.ends)
+        if (self._doubt(pixels, found) or found.seen.mean() < least or not all(found.ends)
                 or abs(found.excess) > WRONG_LENGTH):
             self._line = kept
             return None
         return found
+
+
+def _largest_path(mask: Bools, factor: int) -> Floats | None:
+    """Return the path (n, 2) [px] along the largest area of a mask that was reduced; None: there is none."""
+    parts, number = label(mask, np.ones((3, 3)))
+    if not number:
+        return None
+    sizes = np.bincount(parts.ravel())[1:]
+    v, u = np.nonzero(parts == int(np.argmax(sizes)) + 1)
+    path = _longest(u, v, mask)
+    return path * factor if len(path) >= 8 else None
 
 
 def _longest(u: NDArray[np.int64], v: NDArray[np.int64], mask: Bools) -> Floats:

@@ -141,6 +141,36 @@ def test_what_stays_on_the_table_is_right_while_the_middle_is_lifted():
         assert np.nanmax(off) < FAR
 
 
+def turned(angle):
+    """Return a DLO (n, 3) [m] whose last part is turned [rad]."""
+    arc = np.linspace(0.0, LENGTH, 401)
+    heading = angle / (1.0 + np.exp(-(arc - 0.6 * LENGTH) / 0.02))
+    steps = np.column_stack([np.cos(heading), np.sin(heading)]) * LENGTH / 400
+    flat = np.concatenate([[[0.0, 0.0]], np.cumsum(steps[:-1], axis=0)])
+    return np.column_stack([flat, np.full(len(flat), RADIUS)])
+
+
+@pytest.mark.long
+def test_a_line_goes_on_where_its_rest_comes_out_of_what_hides_it():
+    curves = [turned(0.0)] * 4 + [turned(0.16 * k) for k in range(6)] + [turned(0.8)] * 4
+
+    def drawn(pixels, k):
+        begin, end = 0.24, (0.0, 0.55, 0.35)[(k >= 3) + (k >= 10)]
+        corners = np.array([[begin, -0.2, 0.0], [end, -0.2, 0.0], [end, 0.25, 0.0], [begin, 0.25, 0.0]])
+        covered = np.rint(CAMERA.project(corners)).astype(np.int32)
+        return cv2.fillPoly(pixels.copy(), [covered], (190, 140, 110)) if end else pixels
+
+    found = tracked(curves, drawn=drawn)
+    for one, curve in zip(found[:10], curves, strict=False):
+        assert not one.lost
+        assert np.nanmax(errors(one, curve)[:9]) < FAR
+    # Not at its first sight, but before the whole picture is searched.
+    for one, curve in zip(found[12:], curves[12:], strict=True):
+        off = errors(one, curve)
+        assert np.isfinite(off[-4:-1]).all()
+        assert np.nanmax(off) < FAR
+
+
 def test_a_crossing_keeps_the_order():
     arc = np.linspace(0.0, LENGTH, 401)
     curves = []
