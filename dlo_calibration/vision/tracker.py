@@ -77,6 +77,7 @@ SEEN = 0.35  # mean logarithm of the odds of a colour from which on the DLO is s
 SIDES = np.array([-2.6, -2.2, -1.8, 1.8, 2.2, 2.6])  # half widths beside the DLO, where the ground is seen
 STRANGE = 16.0  # distance in L, a, b of what is behind an end, from which on it is probably covered
 APART = 0.6  # half widths between the line and where the image shows it, from which on it is not seen
+STRANGE_ALONE = 6.0  # the same, as a mean, where the other end is not seen
 LEAST = 0.3  # share of the line that must be seen
 UNEXPLAINED = 0.06  # of the DLO's area: more of its colour elsewhere than usual is too much
 SHOWN = 0.2  # share of the DLO's area that has its colour in the first image, at least
@@ -410,9 +411,10 @@ class Tracker:
         places = np.array([line[k] if end is None else end[0] for k, end in zip((0, -1), ends, strict=True)])
         strange = [0.0 if end is None else end[1] for end in ends]
         covered = int(np.argmax(strange))
-        if all(accepted) and strange[covered] > STRANGE > strange[1 - covered]:
-            accepted[covered] = False
         hold = self._line.hold.behind([None if end is None else end[1] for end in ends])
+        if (strange[covered] > STRANGE > strange[1 - covered]
+                or not all(accepted) and hold.strange[covered] > STRANGE_ALONE):
+            accepted[covered] = False
         while True:
             weights = np.where(accepted, 1.0 / (END * half) ** 2, 0.0)
             if not any(accepted):

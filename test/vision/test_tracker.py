@@ -117,6 +117,21 @@ def test_a_hidden_end_does_not_shift_the_points():
     assert np.nanmax(off) < FAR
 
 
+@pytest.mark.long
+def test_where_a_hand_covers_an_end_is_no_end_though_the_other_end_is_hidden():
+    def drawn(pixels, k):
+        edges = ((-0.05, 0.005 * max(k - 4, 0)), (0.35, 0.55)) if k else ()
+        for begin, end in edges:
+            corners = np.array([[begin, -0.2, 0.0], [end, -0.2, 0.0], [end, 0.2, 0.0], [begin, 0.2, 0.0]])
+            cv2.fillPoly(pixels, [np.rint(CAMERA.project(corners)).astype(np.int32)], (190, 140, 110))
+        return pixels
+
+    curve = bent(0.3)
+    for one in tracked([curve] * 20, drawn=drawn):
+        assert not one.lost
+        assert np.nanmax(errors(one, curve)) < FAR
+
+
 def lifted(height):
     """Return a DLO (n, 3) [m] whose middle is held so high [m]; both ends slide towards it."""
     place = np.linspace(-LENGTH / 2, LENGTH / 2, 2001)
