@@ -8,7 +8,7 @@ The tracer finds the line in the first image.  In each further one the line is e
 beside it, strips of the image say where it is now (`middle_line`); the elastic line through these places
 (`elastic`) keeps its length, and bridges what is hidden.  At last the image is compared with the line: what
 does not look like the DLO is not seen; a line that explains too little, or leaves too much unexplained, is
-lost.
+lost, unless it goes on there.  Which end, or which other part, a hand lifts, is guessed (`hold`).
 """
 
 from __future__ import annotations
@@ -514,20 +514,19 @@ class Tracker:
         """Return the line that goes on where its rest comes out of what hides it; None: none is sure."""
         elsewhere, _, factor = self._elsewhere(pixels, found.line)
         path = _largest_path(elsewhere, factor)
-        seen = np.flatnonzero(found.seen)
-        for order, end in ((1, 1), (-1, 0)):
-            last = seen[-1] if order == 1 else len(found.line) - 1 - seen[0]
-            if path is None or found.ends[end] or last < BRIDGED:
-                continue
-            line = found.line[::order][:last + 1]
-            # The end of the line is that end of the path which is farther away.
-            if np.linalg.norm(path[0] - line[-1]) > np.linalg.norm(path[-1] - line[-1]):
-                path = path[::-1]
-            rest = self._length - self._long(line) - self._long(path)
-            bridge = self._bridge(line[-BRIDGED:], path[:BRIDGED], rest)
-            if bridge is not None:
-                return self._checked(pixels, np.concatenate([line, bridge, path])[::order], LEAST)
-        return None
+        if path is None or all(found.ends):
+            return None
+        order = -1 if found.ends[1] else 1
+        line = found.line[::order]
+        line = line[:np.flatnonzero(found.seen[::order])[-1] + 1]
+        # The DLO ends where the path is farther away.
+        if np.linalg.norm(path[0] - line[-1]) > np.linalg.norm(path[-1] - line[-1]):
+            path = path[::-1]
+        rest = self._length - self._long(line) - self._long(path)
+        bridge = self._bridge(line[-BRIDGED:], path[:BRIDGED], rest)
+        if bridge is None:
+            return None
+        return self._checked(pixels, np.concatenate([line, bridge, path])[::order], LEAST)
 
     def _long(self, line: Floats) -> float:
         return float(arc_lengths(line if self._scale is None else self._scale.points(line))[-1])
@@ -536,8 +535,7 @@ class Tracker:
         """Return the smooth curve (n, 2) [px] of a length from one line to another; None: none has it."""
         share = np.linspace(0.0, 1.0, 22)[1:-1, None]
         gap = after[0] - before[-1]
-        ways = [(part[-1] - part[0]) / max(float(np.linalg.norm(part[-1] - part[0])), 1e-9)
-                       for part in (before, after)]
+        ways = [directions(part[[0, -1]])[0] for part in (before, after)]
         low, high = 0.0, 3.0
         for _ in range(20):
             middle = (low + high) / 2
