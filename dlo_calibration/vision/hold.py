@@ -23,6 +23,7 @@ Bools = NDArray[np.bool_]
 
 BESIDE = 2.0  # points: standard deviation of a filter, which tells what is beside a hidden part
 HELD = 4.0  # difference between both ends, from which on a hand seems to hold one of them
+STILL_HELD = 0.5  # share of that, down to which it still does
 NEWEST = 0.3  # share of what is new in an image
 BOTH = 0.3  # share of the way of the end that moved farthest, from which on the other one moved, too
 CHANGED = 4.0  # times as far: from then on a hand seems to hold an end after all
@@ -36,6 +37,7 @@ class Hold:
 
     :param rested: (n, 2) the line when last all of it lay on the table [px].
     :param strange: (2,) distance in L, a, b of what is behind an end from what is beside it, as a mean.
+    :param held: whether a hand seems to hold an end: something else is behind it than behind the other one.
     :param ends: (2,) how far the ends have been from where they rested [px].
     :param middle: how far a part that was hidden has been [px].
     :param raises: whether a hand seems to hold the middle, not an end.
@@ -44,6 +46,7 @@ class Hold:
 
     rested: Floats
     strange: Floats
+    held: bool
     ends: Floats
     middle: float
     raises: bool
@@ -52,12 +55,14 @@ class Hold:
     @classmethod
     def of(cls, line: Floats, strange: Floats) -> Hold:
         """Return that of a line that lies on the table."""
-        return cls(line, strange, np.zeros(2), 0.0, False, (len(line) - 1) / 2)
+        return cls(line, strange, False, np.zeros(2), 0.0, False, (len(line) - 1) / 2)
 
     def behind(self, strange: Sequence[float | None]) -> Hold:
         """Return the hold after what is behind both ends is seen; None: an end is not seen."""
-        return replace(self, strange=np.array([mean if new is None else mean + NEWEST * (new - mean)
-                                               for new, mean in zip(strange, self.strange, strict=True)]))
+        means = [mean if new is None else mean + NEWEST * (new - mean)
+                 for new, mean in zip(strange, self.strange.tolist(), strict=True)]
+        held = abs(means[0] - means[1]) > HELD * (STILL_HELD if self.held else 1.0)
+        return replace(self, strange=np.array(means), held=held)
 
     def seen(self, line: Floats, ends: Floats, shown: Bools, least: float) -> Hold:
         """
@@ -81,11 +86,6 @@ class Hold:
         raises = not self.held and (surplus > moved.max() or moved.min() > BOTH * moved.max())
         return replace(self, ends=moved, middle=middle, centre=centre,
                        raises=bool(raises and max(middle, moved.max()) > least))
-
-    @property
-    def held(self) -> bool:
-        """Whether a hand seems to hold an end: something else is behind it than behind the other one."""
-        return bool(abs(self.strange[0] - self.strange[1]) > HELD)
 
     def share(self, count: int) -> Floats:
         """Return how much each of the segments (count,) may be in the air, if a hand raises the DLO."""
