@@ -23,7 +23,6 @@ Bools = NDArray[np.bool_]
 
 BESIDE = 2.0  # points: standard deviation of a filter, which tells what is beside a hidden part
 HELD = 4.0  # difference between both ends, from which on a hand seems to hold one of them
-STILL_HELD = 0.5  # share of that, down to which it still does
 NEWEST = 0.3  # share of what is new in an image
 BOTH = 0.3  # share of the way of the end that moved farthest, from which on the other one moved, too
 CHANGED = 4.0  # times as far: from then on a hand seems to hold an end after all
@@ -37,7 +36,7 @@ class Hold:
 
     :param rested: (n, 2) the line when last all of it lay on the table [px].
     :param strange: (2,) distance in L, a, b of what is behind an end from what is beside it, as a mean.
-    :param held: whether a hand seems to hold an end: something else is behind it than behind the other one.
+    :param held: whether a hand seemed to hold an end: something else was behind it than behind the other one.
     :param ends: (2,) how far the ends have been from where they rested [px].
     :param middle: how far a part that was hidden has been [px].
     :param raises: whether a hand seems to hold the middle, not an end.
@@ -61,8 +60,7 @@ class Hold:
         """Return the hold after what is behind both ends is seen; None: an end is not seen."""
         means = [mean if new is None else mean + NEWEST * (new - mean)
                  for new, mean in zip(strange, self.strange.tolist(), strict=True)]
-        held = abs(means[0] - means[1]) > HELD * (STILL_HELD if self.held else 1.0)
-        return replace(self, strange=np.array(means), held=held)
+        return replace(self, strange=np.array(means), held=self.held or abs(means[0] - means[1]) > HELD)
 
     def seen(self, line: Floats, ends: Floats, shown: Bools, least: float) -> Hold:
         """
