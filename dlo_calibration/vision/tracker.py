@@ -8,7 +8,7 @@ The tracer finds the line in the first image.  In each further one the line is e
 beside it, strips of the image say where it is now (`middle_line`); the elastic line through these places
 (`elastic`) keeps its length, and bridges what is hidden.  At last the image is compared with the line: what
 does not look like the DLO is not seen; a line that explains too little, or leaves too much unexplained, is
-lost, unless it goes on there.  Which end, or which other part, a hand lifts, is guessed (`hold`).
+lost, unless it goes on there.  Which end, or which other part, a hand lifts, is guessed (`lift`).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.vision.elastic import directions, Evidence, fitted
-from dlo_calibration.vision.hold import Hold
+from dlo_calibration.vision.lift import Lift
 from dlo_calibration.vision.middle_line import (
     along_line,
     arc_lengths,
@@ -128,14 +128,14 @@ class _Line:
     :param seen: (n,).
     :param ends: whether both ends are seen.
     :param excess: share of the length by which the line between two visible ends is too long.
-    :param hold: which part a hand seems to hold.
+    :param lift: which part a hand seems to lift.
     """
 
     line: Floats
     seen: Bools
     ends: tuple[bool, bool]
     excess: float
-    hold: Hold
+    lift: Lift
 
 
 class Tracker:
@@ -172,7 +172,7 @@ class Tracker:
         middle = straighten(pixels, line, np.full(count, half), np.linspace(-0.4, 0.4, 5))
         self._alike = ALIKE * float(np.median(odds(self._table, middle.lab).mean(axis=1)))
         sure = np.interp(np.linspace(0, 1, count), np.linspace(0, 1, len(trace.sure)), trace.sure) > 0.5
-        self._line = _Line(line, sure, (True, True), 0.0, Hold.of(line, np.zeros(2)))
+        self._line = _Line(line, sure, (True, True), 0.0, Lift.of(line, np.zeros(2)))
         self._velocity: Floats = np.zeros_like(line)
         self._lost_for = 0
         self._shown = 1.0
@@ -193,9 +193,9 @@ class Tracker:
         """
         if scale is not None and self._scale is not None and scale is not self._scale:
             line, rested = (scale.to_pixels(self._scale.points(points))
-                            for points in (self._line.line, self._line.hold.rested))
+                            for points in (self._line.line, self._line.lift.rested))
             if np.isfinite(line).all() and np.isfinite(rested).all():
-                self._line = replace(self._line, line=line, hold=replace(self._line.hold, rested=rested))
+                self._line = replace(self._line, line=line, lift=replace(self._line.lift, rested=rested))
         if scale is not None:
             self._scale = scale  # while nothing of the board is seen, the last one is the best guess
         pixels = self._without_sheet(pixels)
@@ -411,9 +411,9 @@ class Tracker:
         places = np.array([line[k] if end is None else end[0] for k, end in zip((0, -1), ends, strict=True)])
         strange = [0.0 if end is None else end[1] for end in ends]
         covered = int(np.argmax(strange))
-        hold = self._line.hold.behind([None if end is None else end[1] for end in ends])
+        lift = self._line.lift.behind([None if end is None else end[1] for end in ends])
         if (strange[covered] > STRANGE > strange[1 - covered]
-                or not all(accepted) and hold.strange[covered] > STRANGE_ALONE):
+                or not all(accepted) and lift.strange[covered] > STRANGE_ALONE):
             accepted[covered] = False
         while True:
             weights = np.where(accepted, 1.0 / (END * half) ** 2, 0.0)
@@ -421,23 +421,23 @@ class Tracker:
                 known = replace(known, along=np.full(count, 1.0 / (FREE[1] * half) ** 2))
             fit = fitted(line, replace(known, ends=places, end_weights=weights))
             if not all(accepted):
-                return replace(self._line, line=fit, ends=(accepted[0], accepted[1]), excess=0.0, hold=hold)
+                return replace(self._line, line=fit, ends=(accepted[0], accepted[1]), excess=0.0, lift=lift)
             excess = float((np.linalg.norm(np.diff(fit, axis=0), axis=1) / fineness).sum() / self._length - 1)
-            hold = hold.seen(fit, places, across > HIDDEN * across.max(), MOVES * half)
+            lift = lift.seen(fit, places, across > HIDDEN * across.max(), MOVES * half)
             # Behind an end that a hand holds is something else than beside it, and it may be in the air.
-            if hold.raises or ((abs(excess) <= tolerance / 4) if hold.held else (excess >= -tolerance)):
+            if lift.raises or ((abs(excess) <= tolerance / 4) if lift.held else (excess >= -tolerance)):
                 break
             # What covers an end makes the DLO look shorter, and so does an end that is held in the air; both
             # move.
             moved = np.linalg.norm(places - self._line.line[[0, -1]], axis=1)
-            accepted[int(np.argmax(hold.strange if hold.held else moved))] = False
-        found = replace(self._line, line=fit, ends=(True, True), excess=excess, hold=hold)
+            accepted[int(np.argmax(lift.strange if lift.held else moved))] = False
+        found = replace(self._line, line=fit, ends=(True, True), excess=excess, lift=lift)
         if abs(excess) <= tolerance:
-            return replace(found, hold=Hold.of(fit, hold.strange))
+            return replace(found, lift=Lift.of(fit, lift.strange))
         known = replace(known, ends=places, end_weights=weights)
-        if hold.raises:
+        if lift.raises:
             # A part in the air looks longer, or shorter where it rises towards the hand.
-            share = hold.share(count - 1)
+            share = lift.share(count - 1)
             looks = np.maximum(excess * share / share.mean(), -SHORTEST)
             return replace(found, line=fitted(fit, replace(known, lengths=lengths * (1.0 + looks))))
         # A part in the air looks longer: it is one that moves, or is hidden.
@@ -555,7 +555,7 @@ class Tracker:
         if not abs(arc[-1] / self._length - 1) < 2 * WRONG_LENGTH:
             return None
         line = along_line(smooth, arc, np.linspace(0, arc[-1], count))
-        self._line = _Line(line, np.ones(count, bool), (True, True), 0.0, Hold.of(line, np.zeros(2)))
+        self._line = _Line(line, np.ones(count, bool), (True, True), 0.0, Lift.of(line, np.zeros(2)))
         found = self._followed(pixels, line, FAR[1])
         if (self._doubt(pixels, found) or found.seen.mean() < least or not all(found.ends)
                 or abs(found.excess) > WRONG_LENGTH):

@@ -6,7 +6,7 @@
 import numpy as np
 import pytest
 
-from dlo_calibration.vision.hold import Hold
+from dlo_calibration.vision.lift import Lift
 
 LINE = np.column_stack([np.linspace(0.0, 300.0, 61), np.zeros(61)])
 SHOWN = np.ones(61, bool)
@@ -25,49 +25,49 @@ def bent(points, ways):
 
 def test_a_hand_that_hides_what_moves_farthest_raises_it():
     now = bent([0, 20, 40, 60], [0.0, 8.0, 0.0, 0.0])
-    hold = Hold.of(LINE, np.zeros(2)).seen(now, now[[0, -1]], hidden(20), LEAST)
-    assert hold.raises
-    assert hold.centre == pytest.approx(20)
-    share = hold.share(60)
+    lift = Lift.of(LINE, np.zeros(2)).seen(now, now[[0, -1]], hidden(20), LEAST)
+    assert lift.raises
+    assert lift.centre == pytest.approx(20)
+    share = lift.share(60)
     assert np.argmax(share) in (19, 20)
     assert share[-1] == 0.0
 
 
 def test_a_hand_that_only_passes_raises_nothing():
     now = bent([0, 40, 60], [0.0, 0.0, 8.0])
-    hold = Hold.of(LINE, np.zeros(2)).seen(now, now[[0, -1]], hidden(20), LEAST)
-    assert not hold.raises
+    lift = Lift.of(LINE, np.zeros(2)).seen(now, now[[0, -1]], hidden(20), LEAST)
+    assert not lift.raises
 
 
 def test_what_was_raised_stays_so_while_it_comes_back():
     now = bent([0, 20, 40, 60], [0.0, 8.0, 0.0, 0.0])
-    hold = Hold.of(LINE, np.zeros(2)).seen(now, now[[0, -1]], hidden(20), LEAST)
+    lift = Lift.of(LINE, np.zeros(2)).seen(now, now[[0, -1]], hidden(20), LEAST)
     back = bent([0, 20, 40, 60], [0.0, 0.0, 0.0, 0.0])
     for way in (10.0, 20.0):
         ends = LINE[[0, -1]] + [[way, 0.0], [0.0, 0.0]]
-        assert hold.seen(back, ends, hidden(20), LEAST).raises
-    assert not hold.seen(back, LINE[[0, -1]] + [[40.0, 0.0], [0.0, 0.0]], hidden(20), LEAST).raises
+        assert lift.seen(back, ends, hidden(20), LEAST).raises
+    assert not lift.seen(back, LINE[[0, -1]] + [[40.0, 0.0], [0.0, 0.0]], hidden(20), LEAST).raises
 
 
 def test_both_ends_slide_towards_a_hand_that_lifts_straight_up():
     ends = LINE[[0, -1]] + [[6.0, 0.0], [-5.0, 0.0]]
-    assert Hold.of(LINE, np.zeros(2)).seen(LINE, ends, hidden(30), LEAST).raises
+    assert Lift.of(LINE, np.zeros(2)).seen(LINE, ends, hidden(30), LEAST).raises
 
 
 def test_a_hand_behind_an_end_holds_that_end():
     ends = LINE[[0, -1]] + [[6.0, 0.0], [-5.0, 0.0]]
-    hold = Hold.of(LINE, np.zeros(2))
+    lift = Lift.of(LINE, np.zeros(2))
     for _ in range(5):
-        hold = hold.behind([12.0, 1.0])
-    assert hold.held
-    assert not hold.seen(LINE, ends, hidden(30), LEAST).raises
+        lift = lift.behind([12.0, 1.0])
+    assert lift.held
+    assert not lift.seen(LINE, ends, hidden(30), LEAST).raises
     # An end that is not seen changes nothing, and images that show less do not, until the DLO rests.
-    assert hold.behind([None, None]).held
+    assert lift.behind([None, None]).held
     for _ in range(10):
-        hold = hold.behind([1.0, 1.0])
-    assert hold.held
-    assert not Hold.of(LINE, hold.strange).behind([1.0, 1.0]).held
+        lift = lift.behind([1.0, 1.0])
+    assert lift.held
+    assert not Lift.of(LINE, lift.strange).behind([1.0, 1.0]).held
 
 
 def test_nothing_moved_and_nothing_is_raised():
-    assert not Hold.of(LINE, np.zeros(2)).seen(LINE + 0.3, LINE[[0, -1]] + 0.2, SHOWN, LEAST).raises
+    assert not Lift.of(LINE, np.zeros(2)).seen(LINE + 0.3, LINE[[0, -1]] + 0.2, SHOWN, LEAST).raises
