@@ -22,10 +22,10 @@ from dlo_calibration.model.chain import Floats
 Bools = NDArray[np.bool_]
 
 BESIDE = 2.0  # points: standard deviation of a filter, which tells what is beside a hidden part
-HELD = 4.0  # difference between both ends, from which on a hand seems to lift one of them
+HELD = 4.0  # difference between both ends, from which on a hand seems to hold one of them
 NEWEST = 0.3  # share of what is new in an image
 BOTH = 0.3  # share of the way of the end that moved farthest, from which on the other one moved, too
-CHANGED = 4.0  # times as far: from then on a hand seems to lift an end after all
+CHANGED = 4.0  # times as far: from then on a hand seems to hold an end after all
 RAISED = 0.4  # share of the length that a hand lifts to each side
 
 
@@ -36,11 +36,11 @@ class Lift:
 
     :param rested: (n, 2) the line when last all of it lay on the table [px].
     :param strange: (2,) distance in L, a, b of what is behind an end from what is beside it, as a mean.
-    :param held: whether a hand seemed to lift an end: something else was behind it than behind the other one.
+    :param held: whether a hand seems to hold an end: something else was behind it than behind the other one.
     :param ends: (2,) how far the ends have been from where they rested [px].
     :param middle: how far a part that was hidden has been [px].
-    :param raises: whether a hand seems to lift the middle, not an end.
-    :param centre: the point that it seems to lift then, as an index.
+    :param raises: whether a hand seems to lift the middle, and not an end.
+    :param centre: index of the point that it seems to hold then.
     """
 
     rested: Floats
@@ -53,18 +53,18 @@ class Lift:
 
     @classmethod
     def of(cls, line: Floats, strange: Floats) -> Lift:
-        """Return that of a line that lies on the table."""
+        """Return the state of a line that lies on the table: nothing is lifted."""
         return cls(line, strange, False, np.zeros(2), 0.0, False, (len(line) - 1) / 2)
 
     def behind(self, strange: Sequence[float | None]) -> Lift:
-        """Return the lift after what is behind both ends is seen; None: an end is not seen."""
+        """Return the state with what an image shows behind both ends; None: it does not show that end."""
         means = [mean if new is None else mean + NEWEST * (new - mean)
                  for new, mean in zip(strange, self.strange.tolist(), strict=True)]
         return replace(self, strange=np.array(means), held=self.held or abs(means[0] - means[1]) > HELD)
 
     def seen(self, line: Floats, ends: Floats, shown: Bools, least: float) -> Lift:
         """
-        Return the lift after an image.
+        Return the state with what an image shows of the line.
 
         :param line: (n, 2) now [px].
         :param ends: (2, 2) where its ends are seen [px].

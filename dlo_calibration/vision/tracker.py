@@ -19,6 +19,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicHermiteSpline
 from scipy.ndimage import distance_transform_edt, gaussian_filter1d, label
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
@@ -533,16 +534,14 @@ class Tracker:
 
     def _bridge(self, before: Floats, after: Floats, length: float) -> Floats | None:
         """Return the smooth curve (n, 2) [px] of a length from one line to another; None: none has it."""
-        share = np.linspace(0.0, 1.0, 22)[1:-1, None]
+        share = np.linspace(0.0, 1.0, 22)[1:-1]
         gap = after[0] - before[-1]
         ways = [directions(part[[0, -1]])[0] for part in (before, after)]
         low, high = 0.0, 3.0
         for _ in range(20):
             middle = (low + high) / 2
             first, second = (middle * float(np.linalg.norm(gap)) * one for one in ways)
-            # Hermite's cubic polynomial.
-            curve = before[-1] + (share ** 2 * (3 - 2 * share)) * gap + (
-                share * (1 - share) ** 2) * first + (share ** 2 * (share - 1)) * second
+            curve = CubicHermiteSpline((0.0, 1.0), (before[-1], after[0]), (first, second))(share)
             excess = self._long(np.concatenate([before[-1:], curve, after[:1]])) / max(length, 1e-9) - 1
             low, high = (middle, high) if excess < 0 else (low, middle)
         return curve if abs(excess) < WRONG_LENGTH else None

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a hand holds follows from what moved, what is hidden, and what is behind the ends."""
+"""What a hand lifts follows from what moved, what is hidden, and what is behind the ends."""
 
 import numpy as np
 import pytest
