@@ -162,7 +162,7 @@ def _at_clicks(level: Level, clicks: Floats) -> tuple[Floats, float, Floats]:
     for _ in range(3):
         weights = level.inverse @ mean
         vectors = pick(weights)
-        mean = vectors.mean(axis=0)
+        mean = np.median(vectors, axis=0)
     weights = level.inverse @ mean
     typical = max(float(np.median(vectors @ weights)), 1e-9)
     return weights, typical, mean

@@ -5,6 +5,7 @@
 
 from dataclasses import replace
 import functools
+import math
 
 import cv2
 from films import Instant, plain_look, Renderer
@@ -338,3 +339,62 @@ def test_a_white_dlo_is_not_seen_over_a_white_sheet():
     assert np.isfinite(off[1:12]).all()
     assert np.isnan(off[15:]).all()  # over the sheet
     assert np.nanmax(off) < FAR
+
+
+def taped(pixels, curve, camera=CAMERA):
+    """Return a picture in which wrinkled dark tape is wound around a DLO, beside both of its ends."""
+    tape, thick = np.zeros(pixels.shape[:2], np.uint8), 2 * RADIUS * camera.focal_length / camera.distance
+    for begin, end in ((14, 30), (370, 386)):
+        points = np.rint(camera.project(curve[begin:end]) * 16).astype(np.int32)
+        cv2.polylines(tape, [points], False, 255, round(thick), cv2.LINE_8, 4)
+    wrinkles = np.random.default_rng(1).normal((60, 70, 100), 25.0, pixels.shape)
+    return np.where(tape[..., None] > 0, np.clip(wrinkles, 0, 255), pixels).astype(np.uint8)
+
+
+def test_tape_around_a_dlo_is_a_part_of_it():
+    curves = moving(6)
+    found = tracked(curves, drawn=lambda pixels, k: taped(pixels, curves[k]))
+    for one, curve in zip(found, curves, strict=True):
+        off = errors(one, curve)
+        assert np.isfinite(off[1:-1]).all()
+        assert np.nanmax(off) < FAR
+
+
+def held_up(height):
+    """Return a DLO (n, 3) [m] whose first end is held so high [m]; the other end lies on the table."""
+    place = np.linspace(0.0, LENGTH, 2001)
+    rise = height * np.square(np.maximum(1.0 - place / (0.8 * LENGTH), 0.0))
+    arc = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(place), np.diff(rise)))])
+    even = np.linspace(arc[-1] - LENGTH, arc[-1], 401)
+    return np.column_stack([np.interp(even, arc, place), np.zeros(401), np.interp(even, arc, rise) + RADIUS])
+
+
+@pytest.mark.long
+def test_a_line_reaches_the_hand_that_holds_its_end_high_above_the_table():
+    heights = np.concatenate([np.zeros(3), np.linspace(0.0, 0.25, 25), np.full(3, 0.25)])
+    curves = [held_up(height) for height in heights]
+    hands = [(Hand((curve[0, 0] - 0.01, 0.0), math.pi, curve[0, 2]),) if k else ()
+             for k, curve in enumerate(curves)]
+    aslant = Camera(CAMERA.size, 620.0, 0.9, 0.1, 0.0, 1.0, (0.25, 0.05))
+    found = tracked(curves, hands, aslant)
+    seen = aslant.project(curves[-1])
+    for one, curve in zip(found, curves, strict=True):
+        assert not one.lost
+        lies = points_of(curve)[:, 2] < RADIUS + 0.001
+        assert np.nanmax(errors(one, curve, aslant)[lies]) < 1.5 * FAR
+    # The finger tips hide 2 cm of it.
+    first = found[-1].pixels[np.isfinite(found[-1].pixels[:, 0])][0]
+    assert np.linalg.norm(first - seen[0]) < 0.1 * np.linalg.norm(seen[0] - seen[-1])
+
+
+def test_a_finger_beside_a_short_thick_dlo_of_its_colour_is_not_taken_for_it():
+    def drawn(shift, finger):
+        pixels = np.full((240, 320, 3), 235, np.uint8)
+        cv2.line(pixels, (60, 120 + shift), (260, 120 + shift), (150, 105, 80), 16, cv2.LINE_AA)
+        if finger:
+            cv2.line(pixels, (160, 84 + shift), (160, 46 + shift), (150, 105, 80), 15, cv2.LINE_AA)
+        return pixels
+
+    tracker = Tracker(21)
+    tracker.start(drawn(0, False), [(62, 120), (160, 120), (258, 120)])
+    assert not any(tracker.next(drawn(k, True), STEP).lost for k in range(4))

@@ -1,0 +1,183 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The elastic line through what an image shows of a DLO.
+
+It keeps its length between both ends.  Where it cannot, an end is covered, or a part of it is in the air,
+which looks longer or shorter: that part is guessed (`lift`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+
+from dlo_calibration.model.chain import Floats
+from dlo_calibration.vision.appearance import DloImage
+from dlo_calibration.vision.elastic import directions, Evidence, fitted
+from dlo_calibration.vision.lift import Lift
+from dlo_calibration.vision.line_end import LineEnd
+from dlo_calibration.vision.middle_line import arc_lengths
+
+Bools = NDArray[np.bool_]
+
+STRETCH = 0.02  # of a segment's length: standard deviation; a part in the air looks longer
+UNSCALED_STRETCH = 0.05  # the same in a picture without a scale
+LOOSE = 0.01  # of the weight of the lengths, where it is measured how long the DLO looks
+BEND = 0.01  # half widths, standard deviation of a change of second differences from image to image
+KEPT = 0.9  # share of the bends that the line keeps from image to image where the DLO is not seen
+FREE = (10.0, 1.5)  # half widths, deviation from where the line is expected: if an end is seen, or none
+STILL = 0.02  # the same along a part that does not move, while another part is in the air
+END = 0.1  # half widths, standard deviation of an end
+HIDDEN = 0.1  # of the weight of the place that is seen best, below which one is hidden
+SHORTEST = 0.4  # share by which a segment in the air can look shorter
+LONGEST = 1.0  # the same by which the DLO can look longer, as one high above the table does
+MOVES = 0.12  # half widths from image to image, from which on a part moves
+TOLERANCE = 0.006  # share of the length on a table that a line between two visible ends may lack
+UNSCALED = 0.04  # the same in a picture without a scale
+BLURRED = 3.0  # px that it may lack besides, as ends are blurred
+STRANGE = 16.0  # distance in L, a, b of what is behind an end, from which on it is probably covered
+STRANGE_ALONE = 6.0  # the same, as a mean, where the other end is not seen
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedLine:
+    """
+    A line in an image.
+
+    :param line: (n, 2) [px], evenly along the DLO.
+    :param seen: (n,).
+    :param ends: whether both ends are seen.
+    :param excess: share of the length by which the line between two visible ends is too long.
+    :param lift: which part a hand seems to lift.
+    """
+
+    line: Floats
+    seen: Bools
+    ends: tuple[bool, bool]
+    excess: float
+    lift: Lift
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """
+    What an image shows of a DLO.
+
+    :param near: (n, 2) the line beside which it was looked for [px].
+    :param measured: (n, 2) where it is beside that line [px].
+    :param across: (n,) weight of that [1/px^2].
+    :param expected: (n, 2) where it was expected [px].
+    :param ends: both ends; None: not seen.
+    :param half: half its width [px].
+    """
+
+    near: Floats
+    measured: Floats
+    across: Floats
+    expected: Floats
+    ends: tuple[LineEnd | None, LineEnd | None]
+    half: float
+
+
+def elastic_line(image: DloImage, before: TrackedLine, shown: Shown) -> TrackedLine:
+    """Return the line through what an image shows; `seen` is still that of the line before."""
+    fit = _Fit(image, before, shown)
+    covered = [0.0 if end is None else end.strange for end in shown.ends]
+    accepted = np.array([end is not None for end in shown.ends])
+    lift = before.lift.behind([None if end is None else end.strange for end in shown.ends])
+    most = int(np.argmax(covered))
+    if (covered[most] > STRANGE > covered[1 - most]
+            or not all(accepted) and lift.strange[most] > STRANGE_ALONE):
+        accepted[most] = False
+    while all(accepted):
+        line = fit.through(accepted)
+        excess = fit.excess(line)
+        lift = lift.seen(line, fit.places, ~fit.hidden, MOVES * shown.half)
+        # Behind an end that a hand holds is something else than beside it, and it may be in the air.
+        if lift.raises or (abs(excess) <= fit.tolerance / 4 if lift.held else excess >= -fit.tolerance):
+            return fit.between_ends(line, excess, lift)
+        # What covers an end makes the DLO look shorter, and so does an end that is held in the air; both
+        # move.
+        moved = np.linalg.norm(fit.places - before.line[[0, -1]], axis=1)
+        accepted[int(np.argmax(lift.strange if lift.held else moved))] = False
+    ends = (bool(accepted[0]), bool(accepted[1]))
+    found = replace(before, line=fit.through(accepted), ends=ends, excess=0.0, lift=lift)
+    held = int(np.argmin(accepted))
+    if not any(accepted) or not lift.held or shown.ends[held] is None:
+        return found
+    # The DLO does not end before the hand that holds its end.
+    whole = fit.through(np.full(2, True), LOOSE)
+    excess = fit.excess(whole)
+    if not fit.tolerance < excess < LONGEST:
+        return found
+    return replace(found, line=fit.lifted(whole, excess, replace(lift, centre=held * (len(whole) - 1.0))))
+
+
+class _Fit:
+    """The lines that fit what an image shows."""
+
+    def __init__(self, image: DloImage, before: TrackedLine, shown: Shown) -> None:
+        count, half = len(shown.near), shown.half
+        self._before, self._shown, self._length = before, shown, image.dlo.length
+        self._fineness = image.finenesses(shown.near)
+        self._lengths = self._length / (count - 1) * self._fineness
+        stretch = UNSCALED_STRETCH if image.scale is None else STRETCH
+        self._known = Evidence(
+            shown.measured, shown.across, shown.expected, np.full(count, 1.0 / (FREE[0] * half) ** 2),
+            0.2 / (FREE[0] * half) ** 2, self._lengths, 1.0 / (stretch * float(self._lengths.mean())) ** 2,
+            1.0 / (BEND * half) ** 2, np.where(before.seen[1:-1], 1.0, KEPT),
+            np.zeros((2, 2)), np.zeros(2))
+        self.hidden = shown.across <= HIDDEN * shown.across.max()
+        self.places = np.array([shown.near[k] if end is None else end.place
+                                for k, end in zip((0, -1), shown.ends, strict=True)])
+        self.tolerance = UNSCALED if image.scale is None else TOLERANCE
+        self.tolerance += BLURRED / float(arc_lengths(shown.near)[-1])
+
+    def through(self, accepted: Bools, stretch: float = 1.0) -> Floats:
+        """
+        Return the line (n, 2) [px] that ends at those ends (2,) that are accepted.
+
+        :param stretch: share of the weight of its lengths.
+        """
+        free = 1.0 / (FREE[1] * self._shown.half) ** 2
+        known = replace(self._known, ends=self.places, end_weights=self._end_weights(accepted),
+                        along=self._known.along if any(accepted) else np.full_like(self._known.along, free),
+                        stretch=stretch * self._known.stretch)
+        return fitted(self._shown.near, known)
+
+    def _end_weights(self, accepted: Bools) -> Floats:
+        return np.where(accepted, 1.0 / (END * self._shown.half) ** 2, 0.0)
+
+    def excess(self, line: Floats) -> float:
+        """Return the share by which a line (n, 2) is too long."""
+        segments = np.linalg.norm(np.diff(line, axis=0), axis=1)
+        return float((segments / self._fineness).sum() / self._length - 1)
+
+    def between_ends(self, line: Floats, excess: float, lift: Lift) -> TrackedLine:
+        """Return a line between two visible ends, whose excess is given to what is in the air."""
+        found = replace(self._before, line=line, ends=(True, True), excess=excess, lift=lift)
+        if abs(excess) <= self.tolerance:
+            return replace(found, lift=Lift.of(line, lift.strange))
+        if lift.raises:
+            return replace(found, line=self.lifted(line, excess, lift))
+        # A part in the air looks longer: it is one that moves, or is hidden.
+        tangents = directions(self._shown.near)
+        normals = np.column_stack([-tangents[:, 1], tangents[:, 0]])
+        change = np.abs(((line - self._before.line) * normals).sum(axis=1))
+        loose = (change > MOVES * self._shown.half) | self.hidden
+        moving = gaussian_filter1d(loose.astype(float), 3.0, mode='nearest')
+        still = np.where(moving > 0.05, self._known.along, 1.0 / (STILL * self._shown.half) ** 2)
+        known = replace(self._known, ends=self.places, end_weights=self._end_weights(np.full(2, True)))
+        return replace(found, line=fitted(line, replace(known, along=still)))
+
+    def lifted(self, line: Floats, excess: float, lift: Lift) -> Floats:
+        """Return a line near another one (n, 2), of which a part in the air looks longer, or shorter."""
+        share = lift.share(len(line) - 1)
+        looks = np.maximum(excess * share / share.mean(), -SHORTEST)
+        return fitted(line, replace(self._known, ends=self.places, lengths=self._lengths * (1.0 + looks),
+                                    end_weights=self._end_weights(np.full(2, True))))

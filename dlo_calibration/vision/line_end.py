@@ -1,0 +1,109 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The end of a DLO in an image, near the end of a line that follows it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from dlo_calibration.model.chain import Floats
+from dlo_calibration.vision.appearance import DloImage, SEEN
+from dlo_calibration.vision.middle_line import (
+    along_line,
+    arc_lengths,
+    edge_near,
+    end_near,
+    evenly,
+    odds,
+    straighten,
+)
+from dlo_calibration.vision.ridge import Singles
+
+LAST = 30  # stations, within which the last part of the DLO is seen
+SURE = 0.3  # how sure it is of a place of that part, at least
+BEYOND = 6.0  # half widths behind the last part that looks like the DLO, from which on its end is looked for
+LONGEST_TIP = 14  # half widths by which the line may be too short
+FAN = np.radians(np.arange(-50.0, 51.0, 10.0))  # directions in which the DLO may go on
+REACHES = np.array([0.4, 0.8, 1.2, 1.6])  # half widths, where colours are read in each of them
+SIDES = np.array([-2.6, -2.2, -1.8, 1.8, 2.2, 2.6])  # half widths beside the DLO, where the ground is seen
+
+
+@dataclass(frozen=True, eq=False)
+class LineEnd:
+    """
+    An end that is seen.
+
+    :param place: (2,) [px].
+    :param strange: distance in L, a, b of what is behind it from what is beside it, which is large where
+        something covers the DLO from there on.
+    """
+
+    place: Floats
+    strange: float
+
+
+def end_of(image: DloImage, half: float, measured: Floats, quality: Floats,
+           colours: Singles) -> LineEnd | None:
+    """
+    Return the end near the first point of a line; None: it is not seen.
+
+    :param half: half the DLO's width there [px].
+    :param measured: (n, 2) where the image shows the line [px].
+    :param quality: (n,) how sure that is, 0 to 1.
+    :param colours: of the DLO near that end.
+    """
+    near = np.flatnonzero(quality[:LAST] > SURE)
+    if len(near) < 4:
+        return None
+    first = near[0]
+    part = measured[first:first + 8]
+    towards = part[0] - part[-1]
+    towards = towards / max(float(np.linalg.norm(towards)), 1e-9)
+    tip, towards = _tip(image, part[0], towards, half)
+    way = evenly(np.concatenate([tip[-1:] + BEYOND * half * towards, tip[::-1],
+                                 measured[first:first + 14]]), 0.2 * half)
+    arc = arc_lengths(way)
+    inside = image.inside(way, 0.0)
+    if not inside[arc > (BEYOND - 3) * half].all():
+        return None
+    halves = np.full(len(way), half)
+    strip = straighten(image.pixels, way, halves, np.linspace(-0.25, 0.25, 5))
+    logarithms = odds(colours, strip.lab).mean(axis=1, dtype=float)
+    logarithms[~inside] = -1.0
+    end = end_near(arc, logarithms, BEYOND * half, 5 * half + float(arc_lengths(tip)[-1]))
+    if end is None:
+        return None
+    end = edge_near(arc, strip, end, 0.5 * half)
+    # The ground beside the last part, and what is behind the end.
+    beside = straighten(image.pixels, way, halves, SIDES).lab
+    last = (arc > end + 0.5 * half) & (arc < end + 5 * half)
+    behind = strip.lab[(arc < end - 0.8 * half) & (arc > end - 3.0 * half)].reshape(-1, 3)
+    if not len(behind) or not last.any():
+        return None
+    sides = [beside[last][:, part].reshape(-1, 3).mean(axis=0) for part in (slice(0, 3), slice(3, 6))]
+    strange = min(float(np.linalg.norm(behind.mean(axis=0) - side)) for side in sides)
+    return LineEnd(np.asarray(along_line(way, arc, [end])[0]), strange)
+
+
+def _tip(image: DloImage, begin: Floats, towards: Floats, half: float) -> tuple[Floats, Floats]:
+    """Follow the DLO's colour from a point (2,) [px]; return the points (n, 2) and the last direction."""
+    points = [begin]
+    for _ in range(LONGEST_TIP):
+        turned = np.stack([np.cos(FAN), np.sin(FAN)], axis=1)
+        ways = np.stack([turned @ (towards * (1, -1)), turned @ towards[::-1]], axis=1)
+        at = (points[-1] + half * REACHES[:, None] * ways[:, None]).astype(np.float32)
+        colours: Any = cv2.remap(image.pixels, at[..., 0], at[..., 1], cv2.INTER_LINEAR,
+                                 borderMode=cv2.BORDER_REPLICATE)
+        lab: Any = cv2.cvtColor(colours.astype(np.float32) / np.float32(255), cv2.COLOR_RGB2Lab)
+        logarithms = odds(image.dlo.colours, lab).mean(axis=1, dtype=float)
+        best = int(np.argmax(logarithms - FAN ** 2))
+        if logarithms[best] < SEEN:
+            break
+        towards = ways[best]
+        points.append(points[-1] + half * towards)
+    return np.array(points), towards
