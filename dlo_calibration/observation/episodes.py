@@ -116,6 +116,11 @@ def episodes(seen: Sightings, hands: Sequence[HandSightings], count: int | None 
             held[k] += [] if grasp is None else [grasp]
     cut: list[Episode] = []
     problems: list[str] = []
+    if not movements and _shift(_median(seen.points[:5]), _median(seen.points[-5:])) > MOVED:
+        error = InputError('movement', 'a DLO that moves nearly all the time',
+                           f'a rest of {REST:g} s before and after each movement',
+                           'begin to film earlier, and wait after each movement')
+        problems.append(f'{times[0]:.1f} to {times[-1]:.1f} s: {error}')
     for k, (first, last) in enumerate(movements):
         after = movements[k + 1][0] if k + 1 < len(movements) else len(times) - 1
         try:

@@ -178,6 +178,16 @@ def test_a_dlo_at_rest_makes_no_episode():
     assert episodes(seen, [hand]) == ((), ())
 
 
+def test_a_film_without_a_rest_says_what_to_do():
+    seen, hand, _ = filmed_hand()
+    moves = (seen.times > CLOSES + 0.2) & (seen.times < OPENS - 0.2)
+    seen = replace(seen, times=seen.times[moves], points=seen.points[moves], cameras=seen.cameras[moves])
+    hand = replace(hand, positions=hand.positions[moves], orientations=hand.orientations[moves])
+    cut, (problem,) = episodes(seen, [hand])
+    assert not cut
+    assert 'rest' in problem and 'begin to film earlier' in problem
+
+
 @pytest.fixture(scope='module')
 def two_movements():
     """Give the sightings of two movements of 7 s each, between which the DLO jumps back, and the episodes."""
