@@ -94,7 +94,7 @@ def elastic_line(image: DloImage, before: TrackedLine, shown: Shown) -> TrackedL
     if (covered[most] > STRANGE > covered[1 - most]
             or not all(accepted) and lift.strange[most] > STRANGE_ALONE):
         accepted[most] = False
-    while all(accepted):
+    if all(accepted):
         line = fit.through(accepted)
         excess = fit.excess(line)
         lift = lift.seen(line, fit.places, ~fit.hidden, MOVES * shown.half)
