@@ -159,6 +159,7 @@ def _at_clicks(level: Level, clicks: Floats) -> tuple[Floats, float, Floats]:
     # Begin with the click that agrees best with the others.
     alike = (vectors @ level.inverse @ vectors.T) / np.maximum(np.outer(sizes, sizes), 1e-12)
     mean = vectors[np.argmax(alike.sum(axis=1))]
+    # Tape under some of the clicks, or a hand beside them, must not decide: so the median counts.
     for _ in range(3):
         weights = level.inverse @ mean
         vectors = pick(weights)
