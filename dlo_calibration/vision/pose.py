@@ -70,6 +70,10 @@ def scale_from_points(pixels: ArrayLike, table: ArrayLike, size: tuple[int, int]
                          'one that the camera calibration covers', 'mark a point nearer to the middle')
     _check_sides(problem.ideal, places, lambda: _exchanged(problem))
     scale, _ = problem.fit()
+    if not np.isfinite(scale.residual):
+        raise InputError('scale', 'points that no camera in front of the table sees so',
+                         'an image as the camera made it, neither cut nor beside another one',
+                         'take the image itself, check that all places are in metres, or give --camera')
     extent = float(np.linalg.norm(np.ptp(places, axis=0)))
     if not scale.residual <= MOST_RESIDUAL * extent:
         raise InputError(

@@ -196,6 +196,14 @@ def test_pixels_on_one_line_are_refused():
     assert 'on one line' in refusal(overhead(), [[10, 10], [200, 200], [300, 300], [200, 400]], CORNERS)
 
 
+def test_an_image_that_stands_beside_another_one_is_refused():
+    pixels = np.array([[266.0, 393.0], [757.0, 388.0], [700.0, 180.0], [150.0, 180.0]])
+    places = np.array([[-0.277, 0.251], [0.589, 0.26], [0.701, 0.788], [-0.696, 0.788]])
+    scale_from_points(pixels, places, (848, 480))
+    with pytest.raises(InputError, match='neither cut nor beside another one'):
+        scale_from_points(pixels, places, (1696, 480))
+
+
 def test_pixels_outside_are_refused():
     camera = overhead()
     pixels = camera.to_pixels(on_table(CORNERS))
