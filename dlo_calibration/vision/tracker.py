@@ -119,10 +119,6 @@ class Tracker:
         # Where it is thin or blurred, less than its area has its colour.
         self._shown = max(own / self._area(image, line), SHOWN)
         self._usual = free / self._area(image, line)
-        # As in all further images, so that nothing seems to move from this one to the next.
-        found = followed(image, self._line, line, FAR[1])
-        if not self._doubt(image, found) and all(found.ends):
-            self._line = found
         return self._tracked(image)
 
     def next(self, pixels: Pixels, elapsed: float, scale: Scale | None = None) -> Tracked:
