@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Appearance: what a DLO looks like, learned in the first image, and images in which it is looked for."""
+"""Appearance: what a DLO looks like, learned in the first image."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,17 @@ SEEN = 0.35  # mean logarithm of the odds of a colour from which on the DLO is s
 ALIKE = 0.75  # share of the DLO's usual logarithm of the odds from which on a place has its colour
 MARKED = 8  # stations from an end, in which other colours than the DLO's may be
 INNER, OUTER, OFFSETS = 0.5, (1.4, 2.4), np.arange(-2.4, 2.41, 0.08)  # half widths: the DLO, the ground, both
+
+
+def finenesses(line: Floats, scale: Scale | None) -> Floats:
+    """Return the pixels (n - 1,) to a unit of the DLO's length, of each segment of a line (n, 2)."""
+    if scale is None:
+        return np.ones(len(line) - 1)
+    there = np.linalg.norm(np.diff(scale.points(line), axis=0), axis=1)
+    here = np.linalg.norm(np.diff(line, axis=0), axis=1)
+    ratios = here / np.maximum(there, 1e-12)
+    ratios[~np.isfinite(ratios)] = np.nanmedian(ratios)
+    return np.asarray(ratios)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +71,9 @@ class Appearance:
         part = Strip(strip.line[marked], strip.normals[marked], strip.half[marked], strip.offsets,
                      strip.lab[marked])
         marks = np.maximum(colours, learn_colours(part, INNER, OUTER, OTHERS))
-        dlo = cls(float(arc_lengths(flat)[-1]), half, colours, marked, marks, ALIKE * float(np.median(looks)))
-        return replace(dlo, half=half / float(np.median(DloImage(pixels, scale, dlo).finenesses(line))))
+        fineness = float(np.median(finenesses(line, scale)))
+        return cls(float(arc_lengths(flat)[-1]), half / fineness, colours, marked, marks,
+                   ALIKE * float(np.median(looks)))
 
     def colours_near(self, order: int) -> Singles:
         """Return the table near the first end (order 1) or the last one (-1)."""
@@ -71,47 +83,3 @@ class Appearance:
         """Return the mean logarithm of the odds (n,) that colours (n, m, 3) at each station are the DLO's."""
         each = np.where(self.marked[:, None], odds(self.marks, lab), odds(self.colours, lab))
         return np.asarray(each.mean(axis=1, dtype=float))
-
-
-@dataclass(frozen=True, eq=False)
-class DloImage:
-    """
-    An image in which a DLO is looked for.
-
-    :param pixels: (h, w, 3) RGB.
-    :param scale: None: lengths are those in the picture.
-    :param dlo: what it looks like.
-    """
-
-    pixels: Pixels
-    scale: Scale | None
-    dlo: Appearance
-
-    def finenesses(self, line: Floats) -> Floats:
-        """Return the pixels (n - 1,) to a unit of the length, of each segment of a line (n, 2)."""
-        if self.scale is None:
-            return np.ones(len(line) - 1)
-        there = np.linalg.norm(np.diff(self.scale.points(line), axis=0), axis=1)
-        here = np.linalg.norm(np.diff(line, axis=0), axis=1)
-        ratios = here / np.maximum(there, 1e-12)
-        ratios[~np.isfinite(ratios)] = np.nanmedian(ratios)
-        return np.asarray(ratios)
-
-    def halves(self, line: Floats) -> Floats:
-        """Return half the width (n,) of the DLO [px] at each point of a line (n, 2)."""
-        fineness = self.finenesses(line)
-        return np.asarray(self.dlo.half * np.append(fineness, fineness[-1]))
-
-    def width(self, line: Floats) -> float:
-        """Return the width of the DLO [px] along a line (n, 2)."""
-        return 2.0 * self.dlo.half * float(np.median(self.finenesses(line)))
-
-    def arc_lengths(self, line: Floats) -> Floats:
-        """Return the length (n,) from the beginning of a line (n, 2) [px], in the DLO's unit."""
-        return arc_lengths(line if self.scale is None else self.scale.points(line))
-
-    def inside(self, points: Floats, margin: float) -> Bools:
-        """Tell which points (n, 2) [px] are farther than a margin within the picture."""
-        height, width = self.pixels.shape[:2]
-        most = (width - 1 - margin, height - 1 - margin)
-        return np.asarray(((points > margin) & (points < most)).all(axis=1))

@@ -13,17 +13,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.vision.appearance import DloImage
+from dlo_calibration.vision.appearance import Bools
+from dlo_calibration.vision.dlo_image import DloImage
 from dlo_calibration.vision.elastic import directions, Evidence, fitted
 from dlo_calibration.vision.lift import Lift
 from dlo_calibration.vision.line_end import LineEnd
 from dlo_calibration.vision.middle_line import arc_lengths
-
-Bools = NDArray[np.bool_]
 
 STRETCH = 0.02  # of a segment's length: standard deviation; a part in the air looks longer
 UNSCALED_STRETCH = 0.05  # the same in a picture without a scale
@@ -126,15 +124,15 @@ class _Fit:
         self._before, self._shown, self._length = before, shown, image.dlo.length
         self._fineness = image.finenesses(shown.near)
         self._lengths = self._length / (count - 1) * self._fineness
+        self.places = np.array([shown.near[k] if end is None else end.place
+                                for k, end in zip((0, -1), shown.ends, strict=True)])
         stretch = UNSCALED_STRETCH if image.scale is None else STRETCH
         self._known = Evidence(
             shown.measured, shown.across, shown.expected, np.full(count, 1.0 / (FREE[0] * half) ** 2),
             0.2 / (FREE[0] * half) ** 2, self._lengths, 1.0 / (stretch * float(self._lengths.mean())) ** 2,
             1.0 / (BEND * half) ** 2, np.where(before.seen[1:-1], 1.0, KEPT),
-            np.zeros((2, 2)), np.zeros(2))
+            self.places, np.full(2, 1.0 / (END * half) ** 2))
         self.hidden = shown.across <= HIDDEN * shown.across.max()
-        self.places = np.array([shown.near[k] if end is None else end.place
-                                for k, end in zip((0, -1), shown.ends, strict=True)])
         self.tolerance = UNSCALED if image.scale is None else TOLERANCE
         self.tolerance += BLURRED / float(arc_lengths(shown.near)[-1])
 
@@ -145,13 +143,10 @@ class _Fit:
         :param stretch: share of the weight of its lengths.
         """
         free = 1.0 / (FREE[1] * self._shown.half) ** 2
-        known = replace(self._known, ends=self.places, end_weights=self._end_weights(accepted),
+        known = replace(self._known, end_weights=np.where(accepted, self._known.end_weights, 0.0),
                         along=self._known.along if any(accepted) else np.full_like(self._known.along, free),
                         stretch=stretch * self._known.stretch)
         return fitted(self._shown.near, known)
-
-    def _end_weights(self, accepted: Bools) -> Floats:
-        return np.where(accepted, 1.0 / (END * self._shown.half) ** 2, 0.0)
 
     def excess(self, line: Floats) -> float:
         """Return the share by which a line (n, 2) is too long."""
@@ -172,12 +167,10 @@ class _Fit:
         loose = (change > MOVES * self._shown.half) | self.hidden
         moving = gaussian_filter1d(loose.astype(float), 3.0, mode='nearest')
         still = np.where(moving > 0.05, self._known.along, 1.0 / (STILL * self._shown.half) ** 2)
-        known = replace(self._known, ends=self.places, end_weights=self._end_weights(np.full(2, True)))
-        return replace(found, line=fitted(line, replace(known, along=still)))
+        return replace(found, line=fitted(line, replace(self._known, along=still)))
 
     def lifted(self, line: Floats, excess: float, lift: Lift) -> Floats:
         """Return a line near another one (n, 2), of which a part in the air looks longer, or shorter."""
         share = lift.share(len(line) - 1)
         looks = np.maximum(excess * share / share.mean(), -SHORTEST)
-        return fitted(line, replace(self._known, ends=self.places, lengths=self._lengths * (1.0 + looks),
-                                    end_weights=self._end_weights(np.full(2, True))))
+        return fitted(line, replace(self._known, lengths=self._lengths * (1.0 + looks)))

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.vision.appearance import Bools, DloImage, SEEN
+from dlo_calibration.vision.appearance import Bools, SEEN
+from dlo_calibration.vision.dlo_image import DloImage
 from dlo_calibration.vision.elastic import directions
 from dlo_calibration.vision.elastic_line import elastic_line, Shown, TrackedLine
 from dlo_calibration.vision.line_end import end_of
@@ -35,7 +36,7 @@ from dlo_calibration.vision.ridge import Singles
 
 FAR = (9.0, 4.0, 2.4)  # half widths: how far each of the strips reaches beside the line
 STEPS = (0.25, 0.2, 0.08)  # half widths between the offsets of each of them
-DRIFT = 0.15
+DRIFT = 0.15  # cost of a change by 0.2 half widths from one station to the next
 SIGMA = (0.5, 0.3, 0.1)  # half widths: standard deviation of the places that each of them gives
 APART = 0.6  # half widths between the line and where the image shows it, from which on it is not seen
 

@@ -14,12 +14,10 @@ from dataclasses import dataclass, replace
 from typing import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, label
 
 from dlo_calibration.model.chain import Floats
-
-Bools = NDArray[np.bool_]
+from dlo_calibration.vision.appearance import Bools
 
 BESIDE = 2.0  # points: standard deviation of a filter, which tells what is beside a hidden part
 HELD = 4.0  # difference between both ends, from which on a hand seems to hold one of them

@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.vision.appearance import DloImage, SEEN
+from dlo_calibration.vision.appearance import SEEN
+from dlo_calibration.vision.dlo_image import DloImage
 from dlo_calibration.vision.middle_line import (
     along_line,
     arc_lengths,

@@ -16,7 +16,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.vision.appearance import Bools, DloImage
+from dlo_calibration.vision.appearance import Bools
+from dlo_calibration.vision.dlo_image import DloImage
 from dlo_calibration.vision.elastic import directions
 from dlo_calibration.vision.middle_line import odds
 

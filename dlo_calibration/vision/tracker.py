@@ -20,7 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from dlo_calibration.model.chain import Floats, frozen_array
-from dlo_calibration.vision.appearance import Appearance, DloImage
+from dlo_calibration.vision.appearance import Appearance
+from dlo_calibration.vision.dlo_image import DloImage
 from dlo_calibration.vision.elastic_line import TrackedLine
 from dlo_calibration.vision.followed_line import FAR, followed
 from dlo_calibration.vision.lift import Lift

@@ -1,0 +1,54 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""An image in which a DLO is looked for: how large the DLO is in it, and where its borders are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dlo_calibration.model.chain import Floats
+from dlo_calibration.vision.appearance import Appearance, Bools, finenesses
+from dlo_calibration.vision.middle_line import arc_lengths
+from dlo_calibration.vision.photograph import Pixels
+from dlo_calibration.vision.scale import Scale
+
+
+@dataclass(frozen=True, eq=False)
+class DloImage:
+    """
+    An image in which a DLO is looked for.
+
+    :param pixels: (h, w, 3) RGB.
+    :param scale: None: lengths are those in the picture.
+    :param dlo: what it looks like.
+    """
+
+    pixels: Pixels
+    scale: Scale | None
+    dlo: Appearance
+
+    def finenesses(self, line: Floats) -> Floats:
+        """Return the pixels (n - 1,) to a unit of the length, of each segment of a line (n, 2)."""
+        return finenesses(line, self.scale)
+
+    def halves(self, line: Floats) -> Floats:
+        """Return half the width (n,) of the DLO [px] at each point of a line (n, 2)."""
+        fineness = self.finenesses(line)
+        return np.asarray(self.dlo.half * np.append(fineness, fineness[-1]))
+
+    def width(self, line: Floats) -> float:
+        """Return the width of the DLO [px] along a line (n, 2)."""
+        return 2.0 * self.dlo.half * float(np.median(self.finenesses(line)))
+
+    def arc_lengths(self, line: Floats) -> Floats:
+        """Return the length (n,) from the beginning of a line (n, 2) [px], in the DLO's unit."""
+        return arc_lengths(line if self.scale is None else self.scale.points(line))
+
+    def inside(self, points: Floats, margin: float) -> Bools:
+        """Tell which points (n, 2) [px] are farther than a margin within the picture."""
+        height, width = self.pixels.shape[:2]
+        most = (width - 1 - margin, height - 1 - margin)
+        return np.asarray(((points > margin) & (points < most)).all(axis=1))
