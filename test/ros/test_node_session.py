@@ -629,6 +629,7 @@ def test_another_session_goes_on_with_the_same_trials_and_options(start, tmp_pat
         if toy.last:
             assert reached.wait(PATIENCE)
             assert len(unfinished(tmp_path)) == 1
+            graph.until(lambda graph=graph: graph.heard['progress'])  # a result needs one evaluation
             assert graph.session.request('stop')[0]
             going_on.set()
         else:
