@@ -20,6 +20,7 @@ from typing import Any, Mapping, NoReturn, Self, Sequence
 
 from dlo_calibration.errors import InputError, one_of, suggestion
 from dlo_calibration.model.parameters import (
+    BETWEEN_CLAMPS,
     BY_NAME,
     HANDS,
     measured,
@@ -30,8 +31,8 @@ from dlo_calibration.model.parameters import (
     PARAMETERS,
     ParameterSpace,
     PART_NAMES,
-    REST_SHAPE,
     SCALE,
+    STIFFNESS_KNOTS,
 )
 from dlo_calibration.model.pose import NUMBERS, Pose
 from dlo_calibration.search import SEARCHES
@@ -228,7 +229,8 @@ class Options(DeclaredOptions):
         (), 'names of the parameters that differ from session to session, if several sessions of one DLO are '
         'calibrated together, e.g. friction on another table, or mass with another load; each session gets a '
         'value of its own',
-        choices=tuple(name for name in BY_NAME if name not in (*PART_NAMES, *REST_SHAPE)), of=SEARCH)
+        choices=tuple(name for name in BY_NAME
+                      if name not in (*PART_NAMES, *STIFFNESS_KNOTS, *BETWEEN_CLAMPS)), of=SEARCH)
     sessions: str = declared(
         '', 'numbers of trials of each of several sessions of one DLO, in their order, e.g. 4 3; fit with '
         'several sessions sets it; empty: all trials are of one session', of=OBSERVATION)
@@ -355,10 +357,13 @@ class Options(DeclaredOptions):
         adds those that the trials show.
         """
         named = ParameterSpace(self._names)
+        smooth = any(name in self._names or self.values[name] != BY_NAME[name].default
+                     for name in STIFFNESS_KNOTS)
+        values = {name: value for name, value in self.values.items() if smooth or name not in STIFFNESS_KNOTS}
         bent = {name: value for name, value in self.values.items()
-                if name in REST_SHAPE and value != BY_NAME[name].default}
+                if name in BETWEEN_CLAMPS and value != BY_NAME[name].default}
         hands = {name: BY_NAME[name].value(getattr(self, name)) for name in HANDS if getattr(self, name)}
-        space = ParameterSpace(self._names, {**self.values, **hands}, self.mass).divided(
+        space = ParameterSpace(self._names, {**values, **hands}, self.mass).divided(
             max(self.parts, named.parts)).shaped(named.knots or ParameterSpace(self._names, bent).knots)
         return replace(space, free=(*space.free, *(
             own_name(name, session) for name in self.own

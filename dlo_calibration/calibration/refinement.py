@@ -34,7 +34,17 @@ from dlo_calibration.inference.cross_validation import (
     predicts_better,
 )
 from dlo_calibration.model.chain import Floats, frozen_array
-from dlo_calibration.model.parameters import BY_NAME, KNOTS, LOCKING, MOST_PARTS, ParameterSpace
+from dlo_calibration.model.parameters import (
+    BY_NAME,
+    CLAMP_BENDS,
+    GRADES,
+    KNOTS,
+    LOCKING,
+    MOST_PARTS,
+    ParameterSpace,
+    PART_NAMES,
+    STIFFNESS_KNOTS,
+)
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.material import clamp_twist, clamps
 from dlo_calibration.observation.noise import NO_NOISE, noise, with_other_noise
@@ -75,22 +85,33 @@ def refine(setting: Setting, uniform: Fit, budget: int) -> Fit:
         level = math.hypot(noise(trials), _effect_of_starts(setting, uniform))
     except CancelledError:
         return uniform
-    uniform = replace(uniform, validated=uniform.validated + STARTS)
+    uniform = replace(uniform, model=model, validated=uniform.validated + STARTS)
     if uniform.explained(level):
         return uniform
-    ladder, words = _Ladder(setting, replace(uniform, model=model), budget, level), []
+    ladder, words = _Ladder(setting, uniform, budget, level), []
     if _shows_rest_shape(trials, space):
         twist = clamp_twist(trials)
-        rungs = [(knots, partial(_with_knots, knots, twist)) for knots in KNOTS if knots > space.knots]
+        rungs: list[tuple[int | None, Finer]] = [
+            (knots, partial(_with_knots, knots, twist)) for knots in KNOTS if knots > space.knots]
+        bends: tuple[None, Finer] = None, _with_bends
+        rungs = [*rungs[:1], bends, *rungs[1:], bends]
         why = ladder.climb(rungs)
         if may_lock(space):
-            why += ladder.lock(rungs)
+            why += ladder.instead(uniform, [partial(_with_locking, radius) for radius in BEGINNINGS], rungs,
+                                  'locking', 'locks')
         knots = ladder.best.space.knots
-        words.append((f'rest shape with {knots} knots' if knots else 'straight') + why)
+        at_clamps = ', bent at its clamps' if CLAMP_BENDS[0] in ladder.best.space.free else ''
+        words.append((f'rest shape with {knots} knots' if knots else 'straight') + at_clamps + why)
+    even = ladder.best
     counts = [space.parts * 2**k for k in range(1, 4) if space.parts * 2**k <= MOST_PARTS]
-    why = ladder.climb([(count, partial(_with_parts, count)) for count in counts])
+    halved = [(count, partial(_with_parts, count)) for count in counts]
+    why = ladder.climb(halved[:2])
+    smooth = ladder.instead(even, [_with_smooth_stiffness, partial(_as_smooth_as_parts, ladder.best, even)], (),
+                            'a smooth stiffness', 'varies smoothly')
+    if ladder.best.space.parts in counts[1:2]:
+        why = ladder.climb(halved[2:])
     parts = ladder.best.space.parts
-    words.append(f'{parts} part{"s" * (parts > 1)}' + why)
+    words.append(f'{parts} part{"s" * (parts > 1)}' + why + smooth)
     return ladder.outcome('; '.join(words))
 
 
@@ -99,11 +120,12 @@ class _Ladder:
     Tries ever finer spaces, and keeps the best predictor of left-out trials.
 
     :ivar best: the best fit so far; every fit that is tried has its linear model.
+    :ivar over: whether it was stopped, or its budget is too small for more; then it tries nothing else.
     :param level: of noise [m], with what it does at the start; it tries nothing if that explains a fit.
     """
 
     def __init__(self, setting: Setting, best: Fit, budget: int, level: float) -> None:
-        self.best = best
+        self.best, self.over = best, False
         self._best_errors: Floats | None = None  # (f,) [m] see `_left_out`; None: not known yet
         self._setting, self._budget, self._level = setting, budget, level
         self._layout = ResidualLayout.compared(setting.trials)
@@ -114,7 +136,7 @@ class _Ladder:
     def _spent(self) -> int:
         return sum(len(tried.evaluations) for tried in self._tried)
 
-    def climb(self, rungs: Iterable[tuple[int, Finer]]) -> str:
+    def climb(self, rungs: Iterable[tuple[int | None, Finer]]) -> str:
         """
         Try rungs, each from the previous one, until two of them predict no better than the best.
 
@@ -122,7 +144,8 @@ class _Ladder:
         rung that is kept must predict significantly better.  Until then, one that predicts better in the mean
         alone is not kept, but is no failure; after it, that is enough.
 
-        :param rungs: the number of knots or parts of each, and how to refine a space.
+        :param rungs: the number of knots or parts of each, and how to refine a space; None: of what the next
+            rungs do not need.
         :returns: why it ended, in words; empty if there is no finer rung.
         """
         why, latest, missed, shown = '', self.best, 0, False
@@ -130,62 +153,74 @@ class _Ladder:
             if self.best.explained(self._level):
                 break
             space, _ = finer(latest.space, latest.best.point)
+            if space == latest.space:
+                continue
             if self._budget - self._spent < 2 * space.dimension:
-                return f': the rest of the budget is too small to try {count}'
+                self.over = True
+                return f': the rest of the budget is too small to try {count or "bends"}'
             try:
                 stage = self._fitted(latest, finer)
                 errors = None if stage is None else self._fold_errors(stage)
             except CancelledError:
-                return f': stopped before {count} were fitted'
+                self.over = True
+                return f': stopped before {count or "bends"} were fitted'
             except SimulationError:  # the fit of the coarser space remains valid
-                return f': {count} could not be simulated'
-            latest, promising = stage or latest, False
+                return f': {count or "bends"} could not be simulated'
+            gain = 0.0
             if stage is not None and errors is not None:
                 if self._best_errors is None:
                     self._best_errors = self._fold_errors(self.best)
-                promising = log_gains(errors, self._best_errors).mean() > LEAST_GAIN
-                if shown and promising or predicts_better(errors, self._best_errors):
+                gain = log_gains(errors, self._best_errors).mean()
+                if shown and gain > 0 or predicts_better(errors, self._best_errors):
                     self.best, self._best_errors, why, shown = stage, errors, '', True
+                    latest = stage
                     continue
+            if count is None:
+                continue
+            latest = stage or latest
             why = f': {count} would explain too little' if stage is None else \
                 f': {count} would not predict left-out trials better'
-            missed += not promising
+            missed += gain <= LEAST_GAIN
             if missed == 2:
                 break
         return why
 
-    def lock(self, rungs: Sequence[tuple[int, Finer]]) -> str:
+    def instead(self, coarse: Fit, finers: Sequence[Finer], rungs: Sequence[tuple[int | None, Finer]],
+                name: str, does: str) -> str:
         """
-        Climb a second time, with locking; keep where that leads if it predicts better than the best so far.
+        Climb a second time, from another beginning; keep where it leads if that predicts better.
 
-        A DLO that locks has another rest shape, so that only the ends of both climbs can be compared. The
-        second one begins at the uniform DLO, and ends there if locking does not lower the cost.
+        A DLO that locks has another rest shape, and one whose stiffness varies smoothly has no parts, so that
+        only the ends of both climbs can be compared.
 
+        :param coarse: the fit from which the second climb begins; it ends there if the beginnings that
+            `finers` give do not lower the cost.
+        :param name: what is tried, in words; `does`: what a DLO does to which it applies.
         :returns: the outcome in words; empty if it was not tried.
         """
-        if self.best.explained(self._level):
+        if self.over or self.best.explained(self._level):
             return ''
-        uniform = self._tried[0]
-        if self._budget - self._spent < 2 * (uniform.space.dimension + 1):
-            return '; the rest of the budget is too small to try locking'
+        space, _ = finers[0](coarse.space, coarse.best.point)
+        if self._budget - self._spent < 2 * space.dimension:
+            return f'; the rest of the budget is too small to try {name}'
         best, errors = self.best, self._best_errors
         try:
-            locked = self._fitted(uniform, *(partial(_with_locking, radius) for radius in BEGINNINGS))
-            if locked is None or _cost(locked, uniform) > (1 - LEAST_SHARE) * _cost(uniform, uniform):
-                return '; locking would explain too little'
+            begun = self._fitted(coarse, *finers)
+            if begun is None or _cost(begun, coarse) > (1 - LEAST_SHARE) * _cost(coarse, coarse):
+                return f'; {name} would explain too little'
             errors = self._fold_errors(best) if errors is None else errors
-            self.best, self._best_errors = locked, None
+            self.best, self._best_errors = begun, None
             self.climb(rungs)
             if self._best_errors is None:
                 self._best_errors = self._fold_errors(self.best)
         except (CancelledError, SimulationError) as error:
             self.best, self._best_errors = best, errors
-            return '; stopped before locking was fitted' if isinstance(error, CancelledError) else \
-                '; locking could not be simulated'
+            return f'; stopped before {name} was fitted' if isinstance(error, CancelledError) else \
+                f'; {name} could not be simulated'
         if predicts_better(self._best_errors, errors):
-            return '; it locks'
+            return f'; it {does}'
         self.best, self._best_errors = best, errors
-        return '; locking would not predict left-out trials better'
+        return f'; {name} would not predict left-out trials better'
 
     def outcome(self, words: str) -> Fit:
         """Return the best fit with all evaluations, in its space."""
@@ -270,10 +305,36 @@ def _with_knots(count: int, twist: float, space: ParameterSpace, point: Floats
     return shaped, start
 
 
+def _with_bends(space: ParameterSpace, point: Floats) -> tuple[ParameterSpace, Floats]:
+    return space.freed(CLAMP_BENDS, point) if space.knots else (space, point)
+
+
 def _with_locking(radius: float, space: ParameterSpace, point: Floats) -> tuple[ParameterSpace, Floats]:
-    fixed = {name: value for name, value in space.fixed.items() if name != LOCKING}
-    return replace(space, free=(*space.free, LOCKING), fixed=fixed), \
-        np.append(point, BY_NAME[LOCKING].coordinate(radius))
+    locking, start = space.freed((LOCKING,), point)
+    start[-1] = BY_NAME[LOCKING].coordinate(radius)
+    return locking, start
+
+
+def _with_smooth_stiffness(space: ParameterSpace, point: Floats) -> tuple[ParameterSpace, Floats]:
+    return space.freed(STIFFNESS_KNOTS, point)
+
+
+def _as_smooth_as_parts(parts: Fit, even: Fit, space: ParameterSpace, point: Floats
+                        ) -> tuple[ParameterSpace, Floats]:
+    smooth, start = _with_smooth_stiffness(space, point)
+    values = parts.space.physical(parts.space.values(parts.best.point), 1.0)
+    logs = np.log([1.0, *(values[name] for name in PART_NAMES if name in values)])
+    if 'flexibility' not in space.free or len(logs) == 1:
+        return smooth, start
+    ends = logs[[0, -1]] + (logs[[0, -1]] - logs[[1, -2]]) / 2
+    middles = (np.arange(len(logs)) + 0.5) / len(logs)
+    knots = np.exp(np.interp(np.linspace(0, 1, GRADES), [0, *middles, 1], [ends[0], *logs, ends[1]]))
+    flexibility = space.free.index('flexibility')
+    start[flexibility] += (BY_NAME['flexibility'].coordinate(values['flexibility'] * knots[0])
+                           - even.best.point[flexibility])
+    for name, ratio in zip(STIFFNESS_KNOTS, knots[1:] / knots[0], strict=True):
+        start[smooth.free.index(name)] = BY_NAME[name].coordinate(ratio)
+    return smooth, np.clip(start, 0, smooth.upper)
 
 
 def _with_parts(count: int, space: ParameterSpace, point: Floats) -> tuple[ParameterSpace, Floats]:
@@ -296,6 +357,9 @@ def _restated(evaluation: Evaluation, tried: ParameterSpace, space: ParameterSpa
         tried, point = _with_locking(0.0, tried, point)
     if tried.knots != space.knots and space.knots:
         tried, point = tried.with_knots(space.knots, point)
+    for names in (CLAMP_BENDS, STIFFNESS_KNOTS):
+        if names[0] in space.free:
+            tried, point = tried.freed(names, point)
     values = tried.values(point)
     return replace(evaluation, point=frozen_array(space.point(values)),
                    values={name: values[name] for name in space.free})

@@ -241,6 +241,9 @@ class _MjcfWriter:
             lines.append(f'locking: EI has doubled at a bend radius of {measured(rope.locking, "m")}')
         if rope.clamp_twist:
             lines.append(f'the angle of the second clamp, {rope.clamp_twist:.3g} rad')
+        if any(rope.clamp_bends):
+            lines.append('how askew the DLO stands in its clamps, '
+                         f'{", ".join(f"{bend:.3g}" for bend in rope.clamp_bends)} rad')
         return lines
 
 

@@ -17,7 +17,14 @@ from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.result import ParameterEstimate
 from dlo_calibration.inference.uncertainty import NOT_IDENTIFIABLE
 from dlo_calibration.model.chain import Chain, Floats, frozen_array
-from dlo_calibration.model.parameters import BY_NAME, measured, natural_curvature, ParameterSpace, PART_NAMES
+from dlo_calibration.model.parameters import (
+    BY_NAME,
+    CLAMP_BENDS,
+    measured,
+    natural_curvature,
+    ParameterSpace,
+    stiffness_profile,
+)
 from dlo_calibration.observation.noise import NO_NOISE, noise_of, smooth
 from dlo_calibration.observation.table import lying_level, rest_on
 from dlo_calibration.planning.dlo import CalibratedDlo
@@ -46,6 +53,7 @@ class ExportedRope:
     :param frames: (n - 1, 3, 3) material frame of each segment at the start, its columns the direction of the
         segment and two across it, not twisted; turned about the DLO so that the start bends it least.
     :param clamp_twist: angle between the rest shape and a second clamp [rad].
+    :param clamp_bends: both components of the bends at the first and the second clamp [rad].
     :param drag: acceleration against the velocity, relative to it [1/s].
     :param internal_damping: damping of bending and stretching, relative to their stiffness [s].
     :param friction: Coulomb coefficient of the DLO with the table and with itself.
@@ -70,6 +78,7 @@ class ExportedRope:
     natural_curvature: Floats
     frames: Floats
     clamp_twist: float
+    clamp_bends: tuple[float, ...]
     drag: float
     internal_damping: float
     friction: float
@@ -140,8 +149,7 @@ class ExportedRope:
             points = rest_on(points, level)
         lengths = np.diff(places) * physical.get('length_scale', 1.0)
         ends = np.concatenate([[0.0], np.cumsum(lengths)])
-        stiffness = physical['flexibility'] * _relative_stiffness(ends, (
-            1.0, *(physical[name] for name in PART_NAMES if name in physical)))
+        stiffness = physical['flexibility'] * _relative_stiffness(ends, stiffness_profile(physical))
         natural = natural_curvature(physical, ends[1:-1] / ends[-1])
         return cls(
             points=frozen_array(points), rest_lengths=frozen_array(lengths), radius=radius,
@@ -151,7 +159,8 @@ class ExportedRope:
             twisting_stiffness=frozen_array(twisting * stiffness) if twisting > 0 else None,
             natural_curvature=frozen_array(natural),
             frames=frozen_array(_material_frames(points, stiffness[:, None] * natural)),
-            clamp_twist=physical.get('clamp_twist', 0.0), drag=physical['damping'],
+            clamp_twist=physical.get('clamp_twist', 0.0),
+            clamp_bends=tuple(physical.get(name, 0.0) for name in CLAMP_BENDS), drag=physical['damping'],
             internal_damping=physical['internal_damping'], friction=physical['friction'],
             bending_friction=physical.get('bending_friction', 0.0),
             bending_slip=physical.get('bending_slip', 0.0),
@@ -170,7 +179,7 @@ def _without_noise(chain: Chain) -> Chain:
     return Chain(smooth(chain.points, level), features=chain.features) if level > NO_NOISE else chain
 
 
-def _relative_stiffness(ends: Floats, profile: tuple[float, ...]) -> Floats:
+def _relative_stiffness(ends: Floats, profile: Floats) -> Floats:
     """
     Return the bending stiffness at the inner nodes, (n - 2,), relative to that of the first part.
 
@@ -178,7 +187,7 @@ def _relative_stiffness(ends: Floats, profile: tuple[float, ...]) -> Floats:
     bend one after the other, as in `simulation.rod`.
 
     :param ends: (n,) arc lengths of the nodes [m].
-    :param profile: stiffness of parts of equal length, relative to the first one.
+    :param profile: see `stiffness_profile`.
     """
     bounds = np.linspace(0, ends[-1], len(profile) + 1)
     bend = np.concatenate([[0.0], np.cumsum(np.diff(bounds) / profile)])

@@ -15,14 +15,15 @@ from dlo_calibration.evaluation.linearisation import Linearisation, perpendicula
 from dlo_calibration.evaluation.residuals import Huber
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import (
+    BETWEEN_CLAMPS,
     BY_NAME,
     HANDS,
     Parameter,
     PARAMETERS,
     ParameterSpace,
     PART_NAMES,
-    REST_SHAPE,
     SCALE,
+    STIFFNESS_KNOTS,
 )
 from dlo_calibration.search.descent import bounded_least_squares
 
@@ -77,7 +78,8 @@ def _candidates(space: ParameterSpace, parts: bool = True) -> Iterator[tuple[str
     """Yield names, spaces with a more free parameters, and (k, a) values of these in the box to try."""
     for parameter in PARAMETERS:
         name = parameter.name
-        if name in space.free or name in (*PART_NAMES, *REST_SHAPE, *HANDS) or _is_idle(name, space):
+        if name in (*space.free, *PART_NAMES, *STIFFNESS_KNOTS, *BETWEEN_CLAMPS, *HANDS) \
+                or _is_idle(name, space):
             continue
         fixed = {key: value for key, value in space.fixed.items() if key != name}
         now = space.fixed.get(name, parameter.default) / SCALE * parameter.extent
@@ -85,7 +87,7 @@ def _candidates(space: ParameterSpace, parts: bool = True) -> Iterator[tuple[str
         step = 0.5 if parameter.neutral == 0 and not parameter.linear and now == 0 else MOVE
         yield (name, replace(space, free=(*space.free, name), fixed=fixed),
                np.array([[now + step if now + step <= parameter.extent else now - step]]))
-    if parts and space.parts == 1 and 'flexibility' in space.free:
+    if parts and space.parts == 1 and 'flexibility' in space.free and STIFFNESS_KNOTS[0] not in space.free:
         divided = space.divided(4)  # four parts can show a middle that is stiffer than both ends
         even = np.array([BY_NAME[name].default / SCALE * BY_NAME[name].extent for name in PART_NAMES[:3]])
         yield PARTS, divided, even + MOVE * np.eye(len(even))

@@ -167,6 +167,13 @@ def knot_names(knots: int) -> tuple[str, ...]:
     return tuple(f'rest_curvature_{axis}{knot}' for knot in range(1, knots + 1) for axis in 'xy')
 
 
+GRADES = 5  # knots of a bending stiffness that varies smoothly
+PIECES = 64  # that such a DLO has, as in the core
+STIFFNESS_KNOTS = tuple(f'stiffness_knot_{knot}' for knot in range(2, GRADES + 1))
+#: Names of both components of the bend where the DLO leaves its clamps.
+CLAMP_BENDS = tuple(f'clamp_bend_{axis}{clamp}' for clamp in (1, 2) for axis in 'xy')
+
+
 #: The paper's four, then those that are fixed by default.
 PARAMETERS: tuple[Parameter, ...] = (
     Parameter('flexibility', 'bending stiffness EI', 'N m^2', 10**1.0, 10**-5.5, 65.4,
@@ -200,6 +207,9 @@ PARAMETERS: tuple[Parameter, ...] = (
     *(Parameter(part_name(part), f'bending stiffness of part {part} relative to part 1', '1', 0.02, 50.0,
                 50.0, f'how stiff part {part} of the DLO is (see parts)', neutral=1.0)
       for part in range(2, MOST_PARTS + 1)),
+    *(Parameter(name, f'bending stiffness at knot {name[-1]} relative to knot 1', '1', 0.02, 50.0, 50.0,
+                f'how stiff the DLO is at knot {name[-1]} of {GRADES} (see parts)', neutral=1.0)
+      for name in STIFFNESS_KNOTS),
     Parameter('hand_delay', 'delay of the stamps of actions', 's', -0.4, 0.4, 50.0,
               'by how much the stamps of actions are late', linear=True, neutral=0.0),
     *(Parameter(f'hand_shift_{axis}', f'shift of the hands in {axis}', 'm', -0.05, 0.05, 50.0,
@@ -211,6 +221,9 @@ PARAMETERS: tuple[Parameter, ...] = (
     *(Parameter(name, f'component {name[-2]} of the curvature of the rest shape at knot {name[-1]}', '1/m',
                 -25.0, 25.0, 50.0, 'how curved the DLO is there when nothing bends it (see parts)',
                 linear=True, neutral=0.0) for name in knot_names(KNOTS[-1])),
+    *(Parameter(name, f'component {name[-2]} of the bend at clamp {name[-1]}', 'rad', -1.0, 1.0, 50.0,
+                'how bent the DLO is where it leaves this clamp, when nothing bends it (no effect without a '
+                'rest shape)', linear=True, neutral=0.0, stride=1.0) for name in CLAMP_BENDS),
 )
 
 
@@ -250,6 +263,8 @@ PART_NAMES = tuple(part_name(part) for part in range(2, MOST_PARTS + 1))
 #: Of the hands, not of the DLO.
 HANDS = ('hand_delay', 'hand_shift_x', 'hand_shift_y', 'hand_shift_z')
 REST_SHAPE = ('clamp_twist', *knot_names(KNOTS[-1]))
+#: Only trials between two clamps show them.
+BETWEEN_CLAMPS = (*REST_SHAPE, *CLAMP_BENDS)
 PAPER_PARAMETERS = ('flexibility', 'elasticity', 'friction', 'self_collision')
 SCALES = 2  # version of the scales in files; in the first, `flexibility` began at 0.1 N m^2
 _FIRST_FLEXIBILITY = replace(BY_NAME['flexibility'], at_zero=0.1)
@@ -262,7 +277,7 @@ def from_first_scale(value: float) -> float:
 
 def _absent_knots(knots: int) -> tuple[str, ...]:
     """Return the names of the rest shape's parameters that a DLO with this number of knots lacks."""
-    return REST_SHAPE[1 + 2 * knots:] if knots else REST_SHAPE
+    return REST_SHAPE[1 + 2 * knots:] if knots else BETWEEN_CLAMPS
 
 
 @dataclass(frozen=True)
@@ -321,7 +336,7 @@ class ParameterSpace:
     def knots(self) -> int:
         """Number of knots of the rest shape, of `KNOTS`; 0: its curvature is constant."""
         present = {*self.free, *self.fixed}
-        if not present.intersection(REST_SHAPE):
+        if not present.intersection(BETWEEN_CLAMPS):
             return 0
         return next(knots for knots in KNOTS if present.isdisjoint(REST_SHAPE[1 + 2 * knots:]))
 
@@ -329,7 +344,7 @@ class ParameterSpace:
     def parameters(self) -> tuple[Parameter, ...]:
         """The entries of PARAMETERS, without those of parts, knots and hands that are not in the space."""
         absent = {*PART_NAMES[self.parts - 1:], *_absent_knots(self.knots),
-                  *set(HANDS).difference(self.free, self.fixed)}
+                  *{*HANDS, *CLAMP_BENDS, *STIFFNESS_KNOTS}.difference(self.free, self.fixed)}
         return tuple(parameter for parameter in PARAMETERS if parameter.name not in absent)
 
     def divided(self, parts: int) -> ParameterSpace:
@@ -378,6 +393,14 @@ class ParameterSpace:
             components = [values.get(name, BY_NAME[name].default) for name in names[:now]]
             between = np.interp(np.linspace(0, 1, knots), np.linspace(0, 1, now), components)
             values.update(zip(names[:knots], between.tolist(), strict=True))
+        return space, space.point({name: values.get(name, BY_NAME[name].default) for name in space.free})
+
+    def freed(self, names: Sequence[str], point: Sequence[float] | Floats
+              ) -> tuple[ParameterSpace, NDArray[np.float64]]:
+        """Return the space in which these are free, too, and its point for the DLO at the (d,) `point`."""
+        values = {**self.fixed, **self.values(point)}
+        fixed = {name: value for name, value in self.fixed.items() if name not in names}
+        space = replace(self, free=tuple(dict.fromkeys((*self.free, *names))), fixed=fixed)
         return space, space.point({name: values.get(name, BY_NAME[name].default) for name in space.free})
 
     @property
@@ -436,6 +459,21 @@ def of_session(physical: Mapping[str, float], session: int) -> dict[str, float]:
     """Return the physical values that hold in a session, counted from 1, by parameter name."""
     own = {owner(name)[0]: value for name, value in physical.items() if owner(name)[1] == session}
     return {**{name: value for name, value in physical.items() if not owner(name)[1]}, **own}
+
+
+def stiffness_profile(physical: Mapping[str, float]) -> Floats:
+    """
+    Return the (m,) bending stiffnesses of pieces of equal length, relative to `flexibility`.
+
+    :param physical: physical values by parameter name, in SI units.
+    """
+    parts = np.array([1.0, *(physical[name] for name in PART_NAMES if name in physical)])
+    knots = [1.0, *(physical[name] for name in STIFFNESS_KNOTS if name in physical)]
+    if len(knots) == 1:
+        return parts
+    middles = (np.arange(PIECES) + 0.5) / PIECES
+    smooth = np.interp(middles, np.linspace(0, 1, len(knots)), knots)
+    return np.asarray(parts[(middles * len(parts)).astype(int)] * smooth)
 
 
 def natural_curvature(physical: Mapping[str, float], fractions: Floats) -> Floats:

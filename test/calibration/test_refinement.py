@@ -16,7 +16,7 @@ from dlo_calibration.calibration.refinement import _Ladder
 from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.evaluation.evaluation import Evaluator
 from dlo_calibration.model.chain import Chain
-from dlo_calibration.model.parameters import ParameterSpace
+from dlo_calibration.model.parameters import ParameterSpace, stiffness_profile
 from dlo_calibration.simulation.compiled import CompiledSimulator
 
 CURVED = ParameterSpace(('flexibility', 'torsion')).shaped(3)
@@ -131,6 +131,31 @@ def test_a_cable_that_is_curved_and_locks_is_found():
 
 
 @pytest.mark.long
+def test_a_dlo_that_stands_askew_in_its_clamps_is_found():
+    askew = {**REST_SHAPE, 'clamp_bend_x1': 60.0, 'clamp_bend_y1': 47.5, 'clamp_bend_x2': 45.0,
+             'clamp_bend_y2': 61.0}
+    result = calibrated(observed(ParameterSpace(tuple(askew)), askew), budget=400,
+                        names=('flexibility', 'torsion'))
+    assert 'rest shape with 3 knots, bent at its clamps' in result.stop_reason
+    for name, value in askew.items():
+        assert result.values[name] == pytest.approx(value, abs=2.0), name
+    assert result.evaluations[0].values['clamp_bend_x1'] == 50  # of the DLO that stands straight in them
+
+
+@pytest.mark.long
+def test_a_dlo_whose_stiffness_varies_smoothly_is_found():
+    tapered = {**TRUTH, 'stiffness_knot_2': 56.0, 'stiffness_knot_3': 62.0, 'stiffness_knot_4': 70.0,
+               'stiffness_knot_5': 76.0}
+    space = ParameterSpace(tuple(tapered))
+    result = calibrated(observed(space, tapered))
+    assert result.stop_reason.endswith('; it varies smoothly')
+    found, true = (physical['flexibility'] * stiffness_profile(physical)
+                   for physical in (result.physical(), space.physical(tapered, 1.0)))
+    assert found[10:] == pytest.approx(true[10:], rel=0.05)  # hardly anything shows the part in the first clamp
+    assert result.evaluations[0].values['stiffness_knot_5'] == 50  # of the even DLO
+
+
+@pytest.mark.long
 def test_a_rod_whose_errors_have_another_cause_does_not_lock():
     damped = {'flexibility': 61.9, 'torsion': 60.0, 'damping': 65.0}
     result = calibrated(observed(ParameterSpace(tuple(damped)), damped), budget=800, names=tuple(STRANDS))
@@ -158,7 +183,8 @@ def climbed(monkeypatch, *logarithms):
     coming = iter(rungs[1:])
     monkeypatch.setattr(ladder, '_fitted', lambda *arguments: next(coming))
     monkeypatch.setattr(ladder, '_fold_errors', lambda rung: rung.errors)
-    ladder.climb([(count, lambda space, point: (space, point)) for count in (3, 5, 9)])
+    ladder.climb([(count, lambda space, point, count=count: (replace(space, mass=count), point))
+                  for count in (3, 5, 9)])
     return [rung is ladder.best for rung in rungs].index(True)
 
 

@@ -192,7 +192,8 @@ def started(session, out, workers):
         env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)}, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     begun = time.monotonic()
-    while not (out / 'calibrations.jsonl').exists():
+    file = out / 'calibrations.jsonl'
+    while not file.exists() or b'\n' not in file.read_bytes():
         assert process.poll() is None, process.communicate()[1]
         assert time.monotonic() - begun < PATIENCE
         time.sleep(0.01)

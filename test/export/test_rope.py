@@ -42,6 +42,14 @@ def test_parts_have_stiffnesses_of_their_own():
     assert (1 < relative[4:-4]).any() and (relative[4:-4] < stiffer).any()
 
 
+def test_a_stiffness_that_varies_smoothly_does_so_in_it():
+    rope = ExportedRope.of(with_values(**{f'stiffness_knot_{knot}': 75.0 for knot in range(2, 6)}), straight(),
+                           Options(nodes=42))
+    relative, stiffer = rope.bending_stiffness / rope.bending_stiffness[-1], 50**-0.5
+    assert relative[10:] == pytest.approx(np.ones(30))
+    assert relative[:10] == pytest.approx(np.interp(np.arange(1, 11) / 41, [0, 0.25], [stiffer, 1]), rel=0.03)
+
+
 def test_it_rests_on_the_table_where_it_was_seen():
     seen = straight().points + np.random.default_rng(1).normal(0, 1e-3, (21, 3))
     rope = ExportedRope.of(MadeUpDlo(), Chain(seen))

@@ -20,7 +20,7 @@ from scipy.integrate import solve_bvp
 from scipy.optimize import brentq
 
 from dlo_calibration import Action, Chain, Goal, Hand, SimulationError, Trial
-from dlo_calibration.model.parameters import HANDS, PARAMETERS, ParameterSpace
+from dlo_calibration.model.parameters import CLAMP_BENDS, HANDS, PARAMETERS, ParameterSpace
 from dlo_calibration.simulation.bullet import BulletSimulator
 from dlo_calibration.simulation.compiled import CompiledSimulator
 
@@ -38,6 +38,8 @@ NEUTRAL = {parameter.name: parameter.default for parameter in PARAMETERS[7:]}  #
 MIDDLE = {**dict.fromkeys(SPACE.free, 50.0), 'natural_curvature': 20.0, 'flexibility': 72.3,
           'elasticity': 40.0, 'friction': 60.0, 'self_collision': 25.0, 'damping': 50.0,
           'internal_damping': 0.0, 'locking': 0.0, 'mass': 40.0}
+
+BY_CLAMPS = ('clamp_twist', *CLAMP_BENDS)  # what only trials with clamps show
 
 
 def each_engine(*names_and_values):
@@ -325,7 +327,7 @@ def test_two_engines_do_not_affect_each_other(make):
 @functools.cache
 def chains_of(factory, **changed):
     """Return the chains of a rollout with some parameters changed; with clamps for what only they show."""
-    clamps = not {'torsion', 'clamp_twist'}.isdisjoint(changed)
+    clamps = not {'torsion', *BY_CLAMPS}.isdisjoint(changed)
     with closing(factory(time_step=TIME_STEP, **{**SMALL, 'nodes': 15 if clamps else 21})) as engine:
         # With no node between the points that clamps hold.
         given = fold_trial(('hand', 'other'), clamps=True) if clamps else fold_trial()
@@ -346,7 +348,7 @@ def tried_parameters():
 def test_every_parameter_changes_the_rollout(factory, name):
     # Internal damping that is less than the time step's own does nothing.
     value = 90.0 if name == 'internal_damping' else MIDDLE[name] + 20
-    same = {name: MIDDLE[name]} if name in ('torsion', 'clamp_twist') else {}
+    same = {name: MIDDLE[name]} if name in ('torsion', *BY_CLAMPS) else {}
     assert np.abs(chains_of(factory, **{name: value}) - chains_of(factory, **same)).max() > 1e-4
 
 

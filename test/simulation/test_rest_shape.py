@@ -156,3 +156,30 @@ def test_a_dlo_twisted_by_about_half_a_turn_stays_as_it_is_in_the_next_trial(tur
     assert later == pytest.approx(rests, abs=1e-3)
     again = simulator.simulate(twisted(rests, (turn, turn)), physical).chains
     assert again[-1] == pytest.approx(later, abs=1e-3)
+
+
+# Two segments at an angle have a bend of twice the sine of half of it.
+ANGLE = 2 * np.arcsin(np.hypot(0.2, 0.1) / 2)
+LEAVES = np.array([np.cos(ANGLE), *(np.sin(ANGLE) / np.hypot(0.2, 0.1) * np.array([-0.1, 0.2]))])
+
+
+@pytest.mark.parametrize(('clamp', 'leaves'), [(1, LEAVES), (2, -LEAVES)])
+def test_a_dlo_that_nothing_bends_leaves_its_clamp_in_the_direction_of_the_bend(clamp, leaves):
+    points = np.stack([np.linspace(0, 0.5, 21), np.zeros(21), np.full(21, 0.5)], axis=1)
+    held = (0, 1) if clamp == 1 else (20, 19)
+    hand = Hand('hand', tuple(sorted(held)), [0.0, 1.0], [points[held[0]]] * 2)
+    trial = Trial('held', Chain(points), (Action((hand,)),), (Goal(Chain(points), 9.0, held_by=('hand',)),))
+    askew = {f'clamp_bend_{axis}{clamp}': bend for axis, bend in (('x', 0.2), ('y', 0.1))}
+    straight = {f'rest_curvature_{axis}{knot}': 0.0 for axis in 'xy' for knot in (1, 2, 3)}
+    physical = {**ParameterSpace().physical({}, 0.5), 'flexibility': 1e-2, 'damping': 3.0, 'torsion': 1.0,
+                'clamp_twist': 0.0, 'mass': 1e-6, **straight, **askew}
+    simulator = CompiledSimulator(table=False, nodes=21)
+    chain = simulator.simulate(trial, physical).chains[-1]
+    along = (chain[::-1] if clamp == 2 else chain)[2:] - chain[held[1]]
+    assert along[-1] / np.linalg.norm(along[-1]) == pytest.approx(leaves, abs=1e-3)
+    bent = np.linalg.norm(np.cross(along, along[-1]), axis=1) / np.linalg.norm(along[-1])
+    assert bent.max() < 1e-3  # from there on, it is straight
+    # Without resistance to twist, its hands do not say which side of it is bent.
+    assert simulator.simulate(trial, {**physical, 'torsion': 0.0}).chains[-1] == pytest.approx(
+        simulator.simulate(trial, {**physical, 'torsion': 0.0, **dict.fromkeys(askew, 0.0)}).chains[-1])
+    simulator.close()

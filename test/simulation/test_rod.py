@@ -203,6 +203,19 @@ def test_a_cantilever_of_parts_bends_like_its_parts_in_series(profile, count):
     assert tip[2] == pytest.approx(-expected, rel=0.03 if count == 12 else 0.005)
 
 
+@pytest.mark.parametrize('count', [12, 40])
+def test_a_cantilever_whose_stiffness_varies_smoothly_bends_by_the_textbook(count):
+    rest, knots = np.concatenate([[0.01], np.full(count, 1 / count)]), (1.0, 0.6, 0.3, 2.0, 3.0)
+    stiffness, load = 0.8, 0.01 * 9.81 * 0.05
+    physical = properties(stiffness, 1e5, 0.05 * rest.sum(), damping=5.0, internal_damping=0.2)
+    physical.update((f'stiffness_knot_{knot}', value) for knot, value in enumerate(knots[1:], 2))
+    tip = rest_of(Rod(rest, physical, 0.2), straight(rest), (0, 1), 0.01 * GRAVITY)[-1]
+    away = (np.arange(10_000) + 0.5) / 10_000  # from the tip
+    relative = np.interp(1 - away / rest.sum(), np.linspace(0, 1, 5), knots)
+    expected = (load * away**3 / (2 * stiffness * relative)).mean()
+    assert tip[2] == pytest.approx(-expected, rel=0.03 if count == 12 else 0.005)
+
+
 def test_equal_parts_are_one_rod_bit_for_bit():
     rest, plain = np.full(12, 0.03), properties(1e-2, 500.0, 0.05)
     parts = properties(1e-2, 500.0, 0.05, profile=(1.0,) * 6)

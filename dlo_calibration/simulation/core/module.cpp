@@ -107,9 +107,15 @@ Properties properties_of(const py::object& mapping) {
   properties.clamp_twist = get("clamp_twist", 0.0);
   for (int part = 2; physical.contains("stiffness_" + std::to_string(part)); ++part)
     properties.profile.push_back(need("stiffness_" + std::to_string(part)));
+  for (int knot = 2; physical.contains("stiffness_knot_" + std::to_string(knot)); ++knot)
+    properties.grades.push_back(need("stiffness_knot_" + std::to_string(knot)));
   for (int knot = 1; physical.contains("rest_curvature_x" + std::to_string(knot)); ++knot)
     properties.rest_curvature.push_back({need("rest_curvature_x" + std::to_string(knot)),
                                          need("rest_curvature_y" + std::to_string(knot))});
+  for (int clamp : {0, 1})
+    for (int axis : {0, 1})
+      properties.clamp_bends[clamp][axis] =
+          get("clamp_bend_" + std::string(axis ? "y" : "x") + std::to_string(clamp + 1), 0.0);
   return properties;
 }
 

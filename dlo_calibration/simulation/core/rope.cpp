@@ -17,6 +17,7 @@ using namespace baseline;
 namespace {
 
 constexpr double kNan = std::numeric_limits<double>::quiet_NaN();
+constexpr int kPieces = 64;  // into which a DLO of smoothly varying stiffness is divided
 
 /// The k-th of the places that divide a length into `count` equal parts.
 double evenly(double length, int k, int count) { return k == count ? length : k * (length / count); }
@@ -27,6 +28,14 @@ double between(double place, const std::vector<double>& places, const std::vecto
   const auto k = std::upper_bound(places.begin() + 1, places.end(), place) - places.begin();
   const double slope = (values[k] - values[k - 1]) / (places[k] - places[k - 1]);
   return slope * (place - places[k - 1]) + values[k - 1];
+}
+
+/// The value at a share of a length, linear between `values` at evenly spaced places.
+double evenly_between(double share, const std::vector<double>& values) {
+  std::vector<double> places;
+  const int last = static_cast<int>(values.size()) - 1;
+  for (int k = 0; k <= last; ++k) places.push_back(evenly(1.0, k, last));
+  return between(share, places, values);
 }
 
 }  // namespace
@@ -167,13 +176,16 @@ void Rope::hold_frame(const std::vector<bool>& rigid, const std::vector<double>&
   for (int i = 0; i + 1 < segments; ++i) {
     place += rods.rest_lengths[i];
     double x = properties_.natural_curvature, y = 0.0;
-    if (const int last = static_cast<int>(knots.size()) - 1; last > 0) {
-      std::vector<double> places, values[2];
-      for (int k = 0; k <= last; ++k) {
-        places.push_back(evenly(1.0, k, last));
-        for (int c : {0, 1}) values[c].push_back(knots[k][c]);
-      }
-      x += between(place / length_, places, values[0]), y += between(place / length_, places, values[1]);
+    if (knots.size() > 1) {
+      std::vector<double> values[2];
+      for (const auto& knot : knots)
+        for (int c : {0, 1}) values[c].push_back(knot[c]);
+      x += evenly_between(place / length_, values[0]), y += evenly_between(place / length_, values[1]);
+    }
+    const int half = place > length_ / 2;
+    if (rods.twists && rigid[i + half] > rigid[i + 1 - half]) {  // it leaves a clamp here, towards the middle
+      const auto& bend = properties_.clamp_bends[half];
+      x += bend[0] / cells[i], y += bend[1] / cells[i];
     }
     const double stiffness = properties_.bending_stiffness * relative[i];
     const double bending = cells[i] > 0 ? stiffness : 0.0;
@@ -186,7 +198,14 @@ void Rope::hold_frame(const std::vector<bool>& rigid, const std::vector<double>&
 }
 
 std::vector<double> Rope::stiffnesses(const std::vector<bool>& rigid) const {
-  const auto &profile = properties_.profile, &lengths = rods.rest_lengths;
+  const auto &grades = properties_.grades, &lengths = rods.rest_lengths;
+  std::vector<double> profile = properties_.profile;
+  if (grades.size() > 1) {
+    const std::size_t parts = profile.size();
+    profile.resize(kPieces);
+    for (int k = kPieces; k-- > 0;)
+      profile[k] = properties_.profile[k * parts / kPieces] * evenly_between((k + 0.5) / kPieces, grades);
+  }
   const int parts = static_cast<int>(profile.size()), inner = rods.nodes - 2;
   std::vector<double> result(inner, 1.0);
   if (std::all_of(profile.begin(), profile.end(), [](double part) { return part == 1.0; })) return result;
