@@ -106,8 +106,8 @@ def refine(setting: Setting, uniform: Fit, budget: int) -> Fit:
     counts = [space.parts * 2**k for k in range(1, 4) if space.parts * 2**k <= MOST_PARTS]
     halved = [(count, partial(_with_parts, count)) for count in counts]
     why = ladder.climb(halved[:2])
-    smooth = ladder.instead(even, [_with_smooth_stiffness, partial(_as_smooth_as_parts, ladder.best, even)], (),
-                            'a smooth stiffness', 'varies smoothly')
+    beginnings = [_with_smooth_stiffness, partial(_as_smooth_as_parts, ladder.best, even)]
+    smooth = ladder.instead(even, beginnings, (), 'a smooth stiffness', 'varies smoothly')
     if ladder.best.space.parts in counts[1:2]:
         why = ladder.climb(halved[2:])
     parts = ladder.best.space.parts

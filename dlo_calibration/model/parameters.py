@@ -221,9 +221,9 @@ PARAMETERS: tuple[Parameter, ...] = (
     *(Parameter(name, f'component {name[-2]} of the curvature of the rest shape at knot {name[-1]}', '1/m',
                 -25.0, 25.0, 50.0, 'how curved the DLO is there when nothing bends it (see parts)',
                 linear=True, neutral=0.0) for name in knot_names(KNOTS[-1])),
-    *(Parameter(name, f'component {name[-2]} of the bend at clamp {name[-1]}', 'rad', -1.0, 1.0, 50.0,
+    *(Parameter(name, f'component {name[-2]} of the bend at clamp {name[-1]}', 'rad', -0.5, 0.5, 50.0,
                 'how bent the DLO is where it leaves this clamp, when nothing bends it (no effect without a '
-                'rest shape)', linear=True, neutral=0.0, stride=1.0) for name in CLAMP_BENDS),
+                'rest shape)', linear=True, neutral=0.0) for name in CLAMP_BENDS),
 )
 
 

@@ -132,13 +132,13 @@ def test_a_cable_that_is_curved_and_locks_is_found():
 
 @pytest.mark.long
 def test_a_dlo_that_stands_askew_in_its_clamps_is_found():
-    askew = {**REST_SHAPE, 'clamp_bend_x1': 60.0, 'clamp_bend_y1': 47.5, 'clamp_bend_x2': 45.0,
-             'clamp_bend_y2': 61.0}
+    askew = {**REST_SHAPE, 'clamp_bend_x1': 70.0, 'clamp_bend_y1': 45.0, 'clamp_bend_x2': 40.0,
+             'clamp_bend_y2': 72.0}
     result = calibrated(observed(ParameterSpace(tuple(askew)), askew), budget=400,
                         names=('flexibility', 'torsion'))
     assert 'rest shape with 3 knots, bent at its clamps' in result.stop_reason
     for name, value in askew.items():
-        assert result.values[name] == pytest.approx(value, abs=2.0), name
+        assert result.values[name] == pytest.approx(value, abs=4.0), name
     assert result.evaluations[0].values['clamp_bend_x1'] == 50  # of the DLO that stands straight in them
 
 
@@ -151,7 +151,7 @@ def test_a_dlo_whose_stiffness_varies_smoothly_is_found():
     assert result.stop_reason.endswith('; it varies smoothly')
     found, true = (physical['flexibility'] * stiffness_profile(physical)
                    for physical in (result.physical(), space.physical(tapered, 1.0)))
-    assert found[10:] == pytest.approx(true[10:], rel=0.05)  # hardly anything shows the part in the first clamp
+    assert found[10:] == pytest.approx(true[10:], rel=0.05)  # what is in the first clamp hardly shows
     assert result.evaluations[0].values['stiffness_knot_5'] == 50  # of the even DLO
 
 

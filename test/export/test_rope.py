@@ -43,8 +43,8 @@ def test_parts_have_stiffnesses_of_their_own():
 
 
 def test_a_stiffness_that_varies_smoothly_does_so_in_it():
-    rope = ExportedRope.of(with_values(**{f'stiffness_knot_{knot}': 75.0 for knot in range(2, 6)}), straight(),
-                           Options(nodes=42))
+    knots = {f'stiffness_knot_{knot}': 75.0 for knot in range(2, 6)}
+    rope = ExportedRope.of(with_values(**knots), straight(), Options(nodes=42))
     relative, stiffer = rope.bending_stiffness / rope.bending_stiffness[-1], 50**-0.5
     assert relative[10:] == pytest.approx(np.ones(30))
     assert relative[:10] == pytest.approx(np.interp(np.arange(1, 11) / 41, [0, 0.25], [stiffer, 1]), rel=0.03)

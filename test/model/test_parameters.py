@@ -16,7 +16,6 @@ from dlo_calibration import InputError
 from dlo_calibration.model.parameters import (
     BETWEEN_CLAMPS,
     BY_NAME,
-    CLAMP_BENDS,
     HANDS,
     PARAMETERS,
     ParameterSpace,
