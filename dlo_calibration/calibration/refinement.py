@@ -106,10 +106,12 @@ def refine(setting: Setting, uniform: Fit, budget: int) -> Fit:
     counts = [space.parts * 2**k for k in range(1, 4) if space.parts * 2**k <= MOST_PARTS]
     halved = [(count, partial(_with_parts, count)) for count in counts]
     why = ladder.climb(halved[:2])
-    beginnings = [_with_smooth_stiffness, partial(_as_smooth_as_parts, ladder.best, even)]
+    beginnings: list[Finer] = [_with_smooth_stiffness]
+    if ladder.best is not even:
+        beginnings.append(partial(_as_smooth_as_parts, ladder.best, even))
     smooth = ladder.instead(even, beginnings, (), 'a smooth stiffness', 'varies smoothly')
-    if ladder.best.space.parts in counts[1:2]:
-        why = ladder.climb(halved[2:])
+    if ladder.best.space.parts > space.parts and halved[2:] and not ladder.over:
+        why = ladder.climb(halved[2:], shown=True)
     parts = ladder.best.space.parts
     words.append(f'{parts} part{"s" * (parts > 1)}' + why + smooth)
     return ladder.outcome('; '.join(words))
@@ -136,7 +138,7 @@ class _Ladder:
     def _spent(self) -> int:
         return sum(len(tried.evaluations) for tried in self._tried)
 
-    def climb(self, rungs: Iterable[tuple[int | None, Finer]]) -> str:
+    def climb(self, rungs: Iterable[tuple[int | None, Finer]], shown: bool = False) -> str:
         """
         Try rungs, each from the previous one, until two of them predict no better than the best.
 
@@ -146,9 +148,10 @@ class _Ladder:
 
         :param rungs: the number of knots or parts of each, and how to refine a space; None: of what the next
             rungs do not need.
+        :param shown: whether a rung before these was kept.
         :returns: why it ended, in words; empty if there is no finer rung.
         """
-        why, latest, missed, shown = '', self.best, 0, False
+        why, latest, missed = '', self.best, 0
         for count, finer in rungs:
             if self.best.explained(self._level):
                 break
@@ -324,8 +327,6 @@ def _as_smooth_as_parts(parts: Fit, even: Fit, space: ParameterSpace, point: Flo
     smooth, start = _with_smooth_stiffness(space, point)
     values = parts.space.physical(parts.space.values(parts.best.point), 1.0)
     logs = np.log([1.0, *(values[name] for name in PART_NAMES if name in values)])
-    if 'flexibility' not in space.free or len(logs) == 1:
-        return smooth, start
     ends = logs[[0, -1]] + (logs[[0, -1]] - logs[[1, -2]]) / 2
     middles = (np.arange(len(logs)) + 0.5) / len(logs)
     knots = np.exp(np.interp(np.linspace(0, 1, GRADES), [0, *middles, 1], [ends[0], *logs, ends[1]]))

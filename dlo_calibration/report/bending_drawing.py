@@ -20,6 +20,7 @@ from dlo_calibration.model.parameters import (
     natural_curvature,
     number,
     rest_shape,
+    STIFFNESS_KNOTS,
 )
 from dlo_calibration.planning.dlo import Posterior
 from dlo_calibration.report.figure import BAND, BLUE, FAINT, OBSERVED, Panel, panel, SIMULATED
@@ -89,7 +90,8 @@ def moment_panels(result: CalibrationResult) -> list[Panel]:
                   label=f'bending_slip: from {measured(slip, "1/m")} on, the strands slip')
         axes.plot([kept], [0], 'o', color=OBSERVED, markersize=7,
                   label=f'bending_friction: {measured(kept, "1/m")} stay when it is released')
-        axes.set(title=f'moment that bends {"part 1" if space.parts > 1 else "it"} to and fro',
+        one = 'part 1' if space.parts > 1 else 'its first end' if STIFFNESS_KNOTS[0] in space.free else 'it'
+        axes.set(title=f'moment that bends {one} to and fro',
                  xlabel='curvature, from that of the rest shape [1/m]', ylabel=f'moment [{unit}]')
         axes.grid(alpha=0.3)
 

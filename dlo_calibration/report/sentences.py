@@ -20,6 +20,7 @@ from dlo_calibration.model.action import Hand
 from dlo_calibration.model.chain import Chain, Floats, grip_place, in_proportion, SHORT
 from dlo_calibration.model.parameters import (
     BY_NAME,
+    CLAMP_BENDS,
     interval,
     kept_curvature,
     knot_names,
@@ -272,6 +273,8 @@ def rest_shape_sentences(result: CalibrationResult) -> list[str]:
              for draw in Posterior.of(result).draws(DRAWS, seed=0)]
     low, high = np.percentile(drawn, (5, 95)).tolist()
     verdicts = Counter(result.parameters[name].verdict for name in names)
+    bends = np.reshape([result.physical().get(name, 0.0) for name in CLAMP_BENDS], (2, 2))
+    askew = [number(math.degrees(bend)) for bend in np.hypot(*bends.T)]
     shares = [f'{verdicts[verdict]} {words}' for verdict, words in (
         (IDENTIFIABLE, 'are known well'), (WEAK, 'only roughly'),
         (NOT_IDENTIFIABLE, 'could not be determined')) if verdicts[verdict]]
@@ -280,6 +283,7 @@ def rest_shape_sentences(result: CalibrationResult) -> list[str]:
         f'{number(100 * places[most])} % of its length, by {_with_radius(size[most])}, with 90 % probability '
         f'{interval(low, high, "1/m")}; least at {number(100 * places[size.argmin()])} %, by '
         f'{measured(size.min(), "1/m")}.',
+        *[f'It stands askew in its clamps, by {" and ".join(askew)} degrees.'] * bool(bends.any()),
         f'Of the {len(names)} components of this rest shape, {names[0]} to {names[-1]}, '
         f'{", ".join(shares)}.']
 

@@ -111,6 +111,13 @@ def test_sentences_say_where_it_is_curved_and_what_it_keeps(result):
     assert 'rest_curvature' not in words
 
 
+def test_a_sentence_says_how_askew_it_stands_in_its_clamps(result):
+    askew = {'clamp_bend_x1': 80.0, 'clamp_bend_y1': 10.0, 'clamp_bend_x2': 40.0}  # 0.3, -0.4, -0.1 rad
+    stands = replace(result, space=replace(result.space, fixed={**result.space.fixed, **askew}))
+    assert 'It stands askew in its clamps, by 28.6 and 5.73 degrees.' in sentences(stands)
+    assert not any('askew' in text for text in sentences(result))
+
+
 def test_friction_between_strands_gives_a_sentence_only_where_it_is_known(result, without_drawings):
     def bend(**verdicts):
         changed = {name: replace(result.parameters[name], verdict=verdict)
