@@ -20,7 +20,6 @@ from typing import Any, Mapping, NoReturn, Self, Sequence
 
 from dlo_calibration.errors import InputError, one_of, suggestion
 from dlo_calibration.model.parameters import (
-    BETWEEN_CLAMPS,
     BY_NAME,
     HANDS,
     measured,
@@ -31,6 +30,7 @@ from dlo_calibration.model.parameters import (
     PARAMETERS,
     ParameterSpace,
     PART_NAMES,
+    REST_STATE,
     SCALE,
     STIFFNESS_KNOTS,
 )
@@ -230,7 +230,7 @@ class Options(DeclaredOptions):
         'calibrated together, e.g. friction on another table, or mass with another load; each session gets a '
         'value of its own',
         choices=tuple(name for name in BY_NAME
-                      if name not in (*PART_NAMES, *STIFFNESS_KNOTS, *BETWEEN_CLAMPS)), of=SEARCH)
+                      if name not in (*PART_NAMES, *STIFFNESS_KNOTS, *REST_STATE)), of=SEARCH)
     sessions: str = declared(
         '', 'numbers of trials of each of several sessions of one DLO, in their order, e.g. 4 3; fit with '
         'several sessions sets it; empty: all trials are of one session', of=OBSERVATION)
@@ -361,7 +361,7 @@ class Options(DeclaredOptions):
                      for name in STIFFNESS_KNOTS)
         values = {name: value for name, value in self.values.items() if smooth or name not in STIFFNESS_KNOTS}
         bent = {name: value for name, value in self.values.items()
-                if name in BETWEEN_CLAMPS and value != BY_NAME[name].default}
+                if name in REST_STATE and value != BY_NAME[name].default}
         hands = {name: BY_NAME[name].value(getattr(self, name)) for name in HANDS if getattr(self, name)}
         space = ParameterSpace(self._names, {**values, **hands}, self.mass).divided(
             max(self.parts, named.parts)).shaped(named.knots or ParameterSpace(self._names, bent).knots)

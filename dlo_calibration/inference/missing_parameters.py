@@ -15,13 +15,13 @@ from dlo_calibration.evaluation.linearisation import Linearisation, perpendicula
 from dlo_calibration.evaluation.residuals import Huber
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import (
-    BETWEEN_CLAMPS,
     BY_NAME,
     HANDS,
     Parameter,
     PARAMETERS,
     ParameterSpace,
     PART_NAMES,
+    REST_STATE,
     SCALE,
     STIFFNESS_KNOTS,
 )
@@ -78,7 +78,7 @@ def _candidates(space: ParameterSpace, parts: bool = True) -> Iterator[tuple[str
     """Yield names, spaces with a more free parameters, and (k, a) values of these in the box to try."""
     for parameter in PARAMETERS:
         name = parameter.name
-        if name in (*space.free, *PART_NAMES, *STIFFNESS_KNOTS, *BETWEEN_CLAMPS, *HANDS) \
+        if name in (*space.free, *PART_NAMES, *STIFFNESS_KNOTS, *REST_STATE, *HANDS) \
                 or _is_idle(name, space):
             continue
         fixed = {key: value for key, value in space.fixed.items() if key != name}

@@ -48,12 +48,12 @@ from dlo_calibration.inference.uncertainty import (
 )
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import (
-    BETWEEN_CLAMPS,
     extents,
     knot_names,
     KNOTS,
     measured,
     ParameterSpace,
+    REST_STATE,
     SCALE,
 )
 from dlo_calibration.model.score import distances, force_residuals, residuals
@@ -402,7 +402,7 @@ class Appraiser:
         shift = optimum_shift(fit, fit.residuals + np.concatenate([model.finer for model in models]))
         starts = fit.residuals + np.hstack([model.moved for model in models])
         uncertainty = at_minimum(fit, layout, noise=self.noise, shift=shift, starts=starts)
-        fading = np.array([name not in BETWEEN_CLAMPS for name in self.space.free])
+        fading = np.array([name not in REST_STATE for name in self.space.free])
         return Appraisal(names, point, extended(
             fit, uncertainty, lambda points: self._residuals(trials, points), fading, shift), models)
 

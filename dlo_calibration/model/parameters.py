@@ -263,8 +263,8 @@ PART_NAMES = tuple(part_name(part) for part in range(2, MOST_PARTS + 1))
 #: Of the hands, not of the DLO.
 HANDS = ('hand_delay', 'hand_shift_x', 'hand_shift_y', 'hand_shift_z')
 REST_SHAPE = ('clamp_twist', *knot_names(KNOTS[-1]))
-#: Only trials between two clamps show them.
-BETWEEN_CLAMPS = (*REST_SHAPE, *CLAMP_BENDS)
+#: How the DLO is when nothing bends it; only trials between two clamps show that.
+REST_STATE = (*REST_SHAPE, *CLAMP_BENDS)
 PAPER_PARAMETERS = ('flexibility', 'elasticity', 'friction', 'self_collision')
 SCALES = 2  # version of the scales in files; in the first, `flexibility` began at 0.1 N m^2
 _FIRST_FLEXIBILITY = replace(BY_NAME['flexibility'], at_zero=0.1)
@@ -277,7 +277,7 @@ def from_first_scale(value: float) -> float:
 
 def _absent_knots(knots: int) -> tuple[str, ...]:
     """Return the names of the rest shape's parameters that a DLO with this number of knots lacks."""
-    return REST_SHAPE[1 + 2 * knots:] if knots else BETWEEN_CLAMPS
+    return REST_SHAPE[1 + 2 * knots:] if knots else REST_STATE
 
 
 @dataclass(frozen=True)
@@ -336,7 +336,7 @@ class ParameterSpace:
     def knots(self) -> int:
         """Number of knots of the rest shape, of `KNOTS`; 0: its curvature is constant."""
         present = {*self.free, *self.fixed}
-        if not present.intersection(BETWEEN_CLAMPS):
+        if not present.intersection(REST_STATE):
             return 0
         return next(knots for knots in KNOTS if present.isdisjoint(REST_SHAPE[1 + 2 * knots:]))
 

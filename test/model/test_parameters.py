@@ -14,12 +14,12 @@ from random_examples import drawing
 
 from dlo_calibration import InputError
 from dlo_calibration.model.parameters import (
-    BETWEEN_CLAMPS,
     BY_NAME,
     HANDS,
     PARAMETERS,
     ParameterSpace,
     PART_NAMES,
+    REST_STATE,
     STIFFNESS_KNOTS,
 )
 
@@ -84,7 +84,7 @@ def test_a_point_of_the_box_and_the_values_of_its_parameters():
 def test_physical_values_are_free_ones_then_fixed_ones_then_defaults():
     space = ParameterSpace(('flexibility',), {'friction': 10.0})
     physical = space.physical({'flexibility': 60.0}, length=1.0)
-    assert set(physical) == BY_NAME.keys() - {*PART_NAMES, *STIFFNESS_KNOTS, *BETWEEN_CLAMPS, *HANDS}
+    assert set(physical) == BY_NAME.keys() - {*PART_NAMES, *STIFFNESS_KNOTS, *REST_STATE, *HANDS}
     assert physical['flexibility'] == pytest.approx(MAPPING['flexibility'](60), rel=1e-12)
     assert physical['friction'] == pytest.approx(MAPPING['friction'](10), rel=1e-12)
     assert physical['elasticity'] == pytest.approx(
