@@ -183,3 +183,26 @@ def test_a_dlo_that_nothing_bends_leaves_its_clamp_in_the_direction_of_the_bend(
     assert simulator.simulate(trial, {**physical, 'torsion': 0.0}).chains[-1] == pytest.approx(
         simulator.simulate(trial, {**physical, 'torsion': 0.0, **dict.fromkeys(askew, 0.0)}).chains[-1])
     simulator.close()
+
+
+@pytest.mark.parametrize('ratio', [0.5, 1.2])
+def test_a_twisted_ring_leaves_its_plane_as_michell_says(ratio):
+    """At 2 pi sqrt(3) EI / GJ (Michell, On the stability of a bent and twisted wire, 1889)."""
+    around, critical = np.linspace(0, 2 * np.pi, 101), 2 * np.pi * 3**0.5 / ratio
+    points = np.stack([np.sin(around), 1e-3 * np.sin(around), 1 - np.cos(around)], axis=1) / (2 * np.pi)
+    angles = np.linspace(0, 1.1 * critical, 80)
+    times, axis = angles / 0.2, (points[-1] - points[-2]) / np.linalg.norm(points[-1] - points[-2])
+    turns = np.column_stack([np.sin(angles / 2)[:, None] * axis, np.cos(angles / 2)])
+    hands = (Hand('left', (0, 1), [0.0, times[-1]], [points[0]] * 2),
+             Hand('right', (99, 100), times, [points[-1]] * len(times), turns))
+    shares = np.linspace(0.5, 0.999, 100)
+    trial = Trial('ring', Chain(points), (Action(hands),), tuple(
+        Goal(Chain(points), float(share * times[-1]), stable=False, held_by=('left', 'right'))
+        for share in shares))
+    physical = {**ParameterSpace().physical({}, 1.0), 'flexibility': 1e-2, 'mass': 1e-4, 'damping': 3.0,
+                'torsion': ratio, 'elasticity': 1e5, 'self_collision': 2e-3, 'internal_damping': 0.01}
+    simulator = CompiledSimulator(table=False, nodes=101)
+    away = np.abs(simulator.simulate(trial, physical).chains[:, :, 1]).max(axis=1)
+    assert away[0] < 0.01  # m, of a ring of 318 mm
+    assert 1.1 * shares[np.argmax(away > 0.03)] == pytest.approx(0.97, abs=0.04)
+    simulator.close()
