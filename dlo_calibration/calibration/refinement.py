@@ -109,7 +109,8 @@ def refine(setting: Setting, uniform: Fit, budget: int) -> Fit:
     beginnings: list[Finer] = [_with_smooth_stiffness]
     if ladder.best is not even:
         beginnings.append(partial(_as_smooth_as_parts, ladder.best, even))
-    smooth = ladder.instead(even, beginnings, (), 'a smooth stiffness', 'varies smoothly')
+    smooth = '' if 'flexibility' not in space.free else ladder.instead(
+        even, beginnings, (), 'a smooth stiffness', 'varies smoothly')
     if ladder.best.space.parts > space.parts and halved[2:] and not ladder.over:
         why = ladder.climb(halved[2:], shown=True)
     parts = ladder.best.space.parts
