@@ -56,6 +56,7 @@ def tracked(curves, hands=None, camera=CAMERA, drawn=None, scaled=True):
     tracker, listed = Tracker(COUNT), []
     scale = scale_of(camera) if scaled else None
     drawn = drawn or (lambda pixels, k: pixels)
+    renderer().restart()
     for k, curve in enumerate(curves):
         pixels = drawn(renderer().image([Instant(camera, curve, hands[k] if hands else ())]), k)
         if k == 0:
