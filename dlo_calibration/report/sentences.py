@@ -273,8 +273,6 @@ def rest_shape_sentences(result: CalibrationResult) -> list[str]:
              for draw in Posterior.of(result).draws(DRAWS, seed=0)]
     low, high = np.percentile(drawn, (5, 95)).tolist()
     verdicts = Counter(result.parameters[name].verdict for name in names)
-    bends = np.reshape([result.physical().get(name, 0.0) for name in CLAMP_BENDS], (2, 2))
-    askew = [number(math.degrees(bend)) for bend in np.hypot(*bends.T)]
     shares = [f'{verdicts[verdict]} {words}' for verdict, words in (
         (IDENTIFIABLE, 'are known well'), (WEAK, 'only roughly'),
         (NOT_IDENTIFIABLE, 'could not be determined')) if verdicts[verdict]]
@@ -283,9 +281,18 @@ def rest_shape_sentences(result: CalibrationResult) -> list[str]:
         f'{number(100 * places[most])} % of its length, by {_with_radius(size[most])}, with 90 % probability '
         f'{interval(low, high, "1/m")}; least at {number(100 * places[size.argmin()])} %, by '
         f'{measured(size.min(), "1/m")}.',
-        *[f'It stands askew in its clamps, by {" and ".join(askew)} degrees.'] * bool(bends.any()),
         f'Of the {len(names)} components of this rest shape, {names[0]} to {names[-1]}, '
-        f'{", ".join(shares)}.']
+        f'{", ".join(shares)}.', *_askew(result)]
+
+
+def _askew(result: CalibrationResult) -> list[str]:
+    """Say how askew the DLO stands in each clamp where that is known."""
+    physical, known = result.physical(), []
+    for clamp, names in (('first', CLAMP_BENDS[:2]), ('second', CLAMP_BENDS[2:])):
+        bend = math.degrees(math.hypot(*(physical.get(name, 0.0) for name in names)))
+        if bend and any(_verdict(result, name) != NOT_IDENTIFIABLE for name in names):
+            known.append(f'{number(bend)} degrees in the {clamp}')
+    return [f'It stands askew in its clamps: by {" and ".join(known)}.'] * bool(known)
 
 
 def friction_sentences(result: CalibrationResult) -> list[str]:

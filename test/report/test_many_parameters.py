@@ -114,7 +114,12 @@ def test_sentences_say_where_it_is_curved_and_what_it_keeps(result):
 def test_a_sentence_says_how_askew_it_stands_in_its_clamps(result):
     askew = {'clamp_bend_x1': 80.0, 'clamp_bend_y1': 10.0, 'clamp_bend_x2': 40.0}  # 0.3, -0.4, -0.1 rad
     stands = replace(result, space=replace(result.space, fixed={**result.space.fixed, **askew}))
-    assert 'It stands askew in its clamps, by 28.6 and 5.73 degrees.' in sentences(stands)
+    assert 'It stands askew in its clamps: by 28.6 degrees in the first and 5.73 degrees in the second.' \
+        in sentences(stands)
+    unknown = {name: replace(next(iter(result.parameters.values())), verdict=NOT_IDENTIFIABLE)
+               for name in ('clamp_bend_x1', 'clamp_bend_y1')}
+    assert 'It stands askew in its clamps: by 5.73 degrees in the second.' in sentences(
+        replace(stands, estimates={**result.parameters, **unknown}))
     assert not any('askew' in text for text in sentences(result))
 
 
