@@ -105,7 +105,7 @@ def main() -> None:
             mean, spread = np.mean(measured), np.std(measured, ddof=1)
             published = float(np.mean(PUBLISHED[wire]))
             predicted = snap(published, NODES[-1], stiffness['physical_value'])
-            beside = [snap(published, NODES[0], stiffness[f'physical_{end}']) for end in ('lower', 'upper')]
+            beside = [snap(published, NODES[-1], stiffness[f'physical_{end}']) for end in ('lower', 'upper')]
             found.append((
                 wire, f'{stiffness["physical_value"]:.3g} [{stiffness["physical_lower"]:.3g}, '
                 f'{stiffness["physical_upper"]:.3g}]', f'{mean:.0f} ± {spread:.0f}',

@@ -37,7 +37,6 @@ from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import (
     BY_NAME,
     CLAMP_BENDS,
-    GRADES,
     KNOTS,
     LOCKING,
     MOST_PARTS,
@@ -147,8 +146,8 @@ class _Ladder:
         rung that is kept must predict significantly better.  Until then, one that predicts better in the mean
         alone is not kept, but is no failure; after it, that is enough.
 
-        :param rungs: the number of knots or parts of each, and how to refine a space; None: of what the next
-            rungs do not need.
+        :param rungs: the number of knots or parts of each, and how to refine a space; None for bends at
+            clamps: where these are not kept, the next rung is refined from the one before them.
         :param shown: whether a rung before these was kept.
         :returns: why it ended, in words; empty if there is no finer rung.
         """
@@ -325,12 +324,14 @@ def _with_smooth_stiffness(space: ParameterSpace, point: Floats) -> tuple[Parame
 
 def _as_smooth_as_parts(parts: Fit, even: Fit, space: ParameterSpace, point: Floats
                         ) -> tuple[ParameterSpace, Floats]:
+    """Begin at the stiffness of the parts of a fit, drawn through their middles."""
     smooth, start = _with_smooth_stiffness(space, point)
     values = parts.space.physical(parts.space.values(parts.best.point), 1.0)
     logs = np.log([1.0, *(values[name] for name in PART_NAMES if name in values)])
     ends = logs[[0, -1]] + (logs[[0, -1]] - logs[[1, -2]]) / 2
     middles = (np.arange(len(logs)) + 0.5) / len(logs)
-    knots = np.exp(np.interp(np.linspace(0, 1, GRADES), [0, *middles, 1], [ends[0], *logs, ends[1]]))
+    places = np.linspace(0, 1, len(STIFFNESS_KNOTS) + 1)
+    knots = np.exp(np.interp(places, [0, *middles, 1], [ends[0], *logs, ends[1]]))
     flexibility = space.free.index('flexibility')
     start[flexibility] += (BY_NAME['flexibility'].coordinate(values['flexibility'] * knots[0])
                            - even.best.point[flexibility])

@@ -167,9 +167,9 @@ def knot_names(knots: int) -> tuple[str, ...]:
     return tuple(f'rest_curvature_{axis}{knot}' for knot in range(1, knots + 1) for axis in 'xy')
 
 
-GRADES = 5  # knots of a bending stiffness that varies smoothly
-PIECES = 64  # that such a DLO has, as in the core
-STIFFNESS_KNOTS = tuple(f'stiffness_knot_{knot}' for knot in range(2, GRADES + 1))
+#: Names of the stiffnesses, relative to that at the first knot, of a DLO whose stiffness varies smoothly.
+STIFFNESS_KNOTS = tuple(f'stiffness_knot_{knot}' for knot in range(2, 6))
+PIECES = 64  # into which such a DLO is divided, as in the core
 #: Names of both components of the bend where the DLO leaves its clamps.
 CLAMP_BENDS = tuple(f'clamp_bend_{axis}{clamp}' for clamp in (1, 2) for axis in 'xy')
 
@@ -208,8 +208,8 @@ PARAMETERS: tuple[Parameter, ...] = (
                 50.0, f'how stiff part {part} of the DLO is (see parts)', neutral=1.0)
       for part in range(2, MOST_PARTS + 1)),
     *(Parameter(name, f'bending stiffness at knot {name[-1]} relative to knot 1', '1', 0.02, 50.0, 50.0,
-                f'how stiff the DLO is at knot {name[-1]} of {GRADES} (see parts)', neutral=1.0)
-      for name in STIFFNESS_KNOTS),
+                f'how stiff the DLO is at knot {name[-1]} of {len(STIFFNESS_KNOTS) + 1} (see parts)',
+                neutral=1.0) for name in STIFFNESS_KNOTS),
     Parameter('hand_delay', 'delay of the stamps of actions', 's', -0.4, 0.4, 50.0,
               'by how much the stamps of actions are late', linear=True, neutral=0.0),
     *(Parameter(f'hand_shift_{axis}', f'shift of the hands in {axis}', 'm', -0.05, 0.05, 50.0,

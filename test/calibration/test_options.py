@@ -12,7 +12,14 @@ from random_examples import drawing
 
 from dlo_calibration import InputError
 from dlo_calibration.calibration.options import FIXED_VALUES, Options
-from dlo_calibration.model.parameters import BY_NAME, HANDS, PARAMETERS, REST_SHAPE
+from dlo_calibration.model.parameters import (
+    BY_NAME,
+    CLAMP_BENDS,
+    HANDS,
+    PARAMETERS,
+    REST_SHAPE,
+    STIFFNESS_KNOTS,
+)
 from dlo_calibration.search import SEARCHES
 
 DECLARED = {declaration.name: declaration for declaration in Options.declarations()}
@@ -189,3 +196,16 @@ def test_a_rest_shape_that_is_given_is_simulated_though_it_is_not_calibrated():
     assert not set(space.free) & set(REST_SHAPE)
     assert space.physical({}, 1.0)['rest_curvature_y4'] == BY_NAME['rest_curvature_y4'].physical(70.0)
     assert 'rest_curvature_y4' not in Options().space.physical({}, 1.0)
+
+
+@pytest.mark.parametrize(('names', 'knots'), [(CLAMP_BENDS, 3), (STIFFNESS_KNOTS, 0)])
+def test_what_a_dlo_rarely_has_is_there_when_it_is_named(names, knots):
+    # Bends at clamps need a rest shape, in whose frame they are.
+    assert not Options().space.physical({}, 1.0).keys() & {*names}
+    found = Options(calibrate=('flexibility', names[0])).space
+    assert names[0] in found.free and found.knots == knots
+    fixed = Options(values={names[1]: 70.0}).space
+    assert fixed.knots == knots and names[0] not in fixed.free
+    physical = fixed.physical({}, 1.0)
+    assert physical[names[0]] == BY_NAME[names[0]].neutral
+    assert physical[names[1]] == BY_NAME[names[1]].physical(70.0)

@@ -91,6 +91,15 @@ def test_physical_values_are_free_ones_then_fixed_ones_then_defaults():
         MAPPING['elasticity'](BY_NAME['elasticity'].default), rel=1e-12)
 
 
+def test_parameters_that_are_freed_begin_where_they_were():
+    space = ParameterSpace(('flexibility',), {'stiffness_knot_2': 60.0})
+    wider, point = space.freed(STIFFNESS_KNOTS, space.point({'flexibility': 40.0}))
+    assert wider.free == ('flexibility', *STIFFNESS_KNOTS) and not wider.fixed
+    assert wider.values(point) == pytest.approx(
+        {'flexibility': 40.0, **dict.fromkeys(STIFFNESS_KNOTS, 50.0), 'stiffness_knot_2': 60.0})
+    assert wider.freed(STIFFNESS_KNOTS, point)[0] == wider
+
+
 def test_more_of_the_object_is_off_by_default_exactly():
     physical = ParameterSpace().physical({}, length=1.0)
     names = ('length_scale', 'natural_curvature', 'marker_mass', 'torsion', 'bending_friction', 'locking')

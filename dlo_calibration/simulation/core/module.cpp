@@ -108,7 +108,7 @@ Properties properties_of(const py::object& mapping) {
   for (int part = 2; physical.contains("stiffness_" + std::to_string(part)); ++part)
     properties.profile.push_back(need("stiffness_" + std::to_string(part)));
   for (int knot = 2; physical.contains("stiffness_knot_" + std::to_string(knot)); ++knot)
-    properties.grades.push_back(need("stiffness_knot_" + std::to_string(knot)));
+    properties.stiffness_knots.push_back(need("stiffness_knot_" + std::to_string(knot)));
   for (int knot = 1; physical.contains("rest_curvature_x" + std::to_string(knot)); ++knot)
     properties.rest_curvature.push_back({need("rest_curvature_x" + std::to_string(knot)),
                                          need("rest_curvature_y" + std::to_string(knot))});

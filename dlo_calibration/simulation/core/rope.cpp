@@ -198,13 +198,13 @@ void Rope::hold_frame(const std::vector<bool>& rigid, const std::vector<double>&
 }
 
 std::vector<double> Rope::stiffnesses(const std::vector<bool>& rigid) const {
-  const auto &grades = properties_.grades, &lengths = rods.rest_lengths;
+  const auto &stiffness_knots = properties_.stiffness_knots, &lengths = rods.rest_lengths;
   std::vector<double> profile = properties_.profile;
-  if (grades.size() > 1) {
+  if (stiffness_knots.size() > 1) {
     const std::size_t parts = profile.size();
     profile.resize(kPieces);
     for (int k = kPieces; k-- > 0;)
-      profile[k] = properties_.profile[k * parts / kPieces] * evenly_between((k + 0.5) / kPieces, grades);
+      profile[k] = properties_.profile[k * parts / kPieces] * evenly_between((k + 0.5) / kPieces, stiffness_knots);
   }
   const int parts = static_cast<int>(profile.size()), inner = rods.nodes - 2;
   std::vector<double> result(inner, 1.0);

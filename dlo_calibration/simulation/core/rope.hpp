@@ -195,7 +195,7 @@ struct Properties {
   double length_scale = 1.0, natural_curvature = 0.0, marker_mass = 0.0, torsion = 0.0;
   double bending_friction = 0.0, bending_slip = 0.1, locking = 0.0, clamp_twist = 0.0;
   std::vector<double> profile = {1.0};  // bending stiffness of parts of equal length, relative to the first
-  std::vector<double> grades = {1.0};   // it is multiplied by these, at evenly spaced places, linear between them
+  std::vector<double> stiffness_knots = {1.0};  // multiply it, at evenly spaced places and linear between them
   std::vector<std::array<double, 2>> rest_curvature;  // [1/m] at evenly spaced places
   std::array<std::array<double, 2>, 2> clamp_bends{};  // [rad] where it leaves a clamp in either half
 };
