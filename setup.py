@@ -87,10 +87,10 @@ setup(
         'numpy>=1.26',
         'opencv-python-headless>=4.6',
         'pillow>=9.4',
+        'PyYAML>=6.0',
         'pybullet>=3.2.5; python_version < "3.12"',  # for later ones PyPI has no binary
         'rich>=13.7',
         'rosbags>=0.11',
-        'ruamel.yaml>=0.17',
         'scipy>=1.11',
         'zstandard>=0.22',
     ],

@@ -10,8 +10,8 @@ from pathlib import Path
 import stat
 from typing import Any, Iterator
 
-from ruamel.yaml import YAML
-from ruamel.yaml.events import (
+import yaml
+from yaml.events import (
     AliasEvent,
     DocumentStartEvent,
     Event,
@@ -66,7 +66,8 @@ def parse_yaml(octets: bytes) -> Any:
     """
     if b'\0' in octets:
         raise ValueError('no text')
-    events = islice(YAML(typ='safe', pure=True).parse(octets.decode('utf-8')), MAXIMUM_EVENTS)
+    loader = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)  # the fast one, where PyYAML was built with it
+    events = islice(yaml.parse(octets.decode('utf-8'), loader), MAXIMUM_EVENTS)
     return _plain(event for event in events if not isinstance(event, (StreamStartEvent, DocumentStartEvent)))
 
 

@@ -171,6 +171,16 @@ def test_importing_the_package_loads_no_heavy_library():
     assert done.stdout.split() == []
 
 
+@pytest.mark.parametrize('name', ['calibrator', 'planner'])
+def test_a_node_that_sees_no_image_loads_nothing_that_does(name):
+    program = f'import sys, {PACKAGE}.ros.{name}_node; print(*sys.modules)'
+    done = subprocess.run([sys.executable, '-c', program], cwd=FOLDER.parent, check=True, capture_output=True,
+                          text=True)
+    loaded = set(done.stdout.split())
+    assert 'rclpy' in loaded
+    assert not loaded & {'cv2', 'matplotlib', 'pybullet', 'scipy', f'{PACKAGE}.vision'}
+
+
 @pytest.mark.parametrize('commands, needed', LOADED, ids=lambda value: ' '.join(sorted(map(str, value))))
 def test_a_command_loads_only_what_it_needs(commands, needed, tmp_path):
     words = [[str(FOLDER.parent / word) if word.startswith('msg_samples') else word for word in command]

@@ -26,7 +26,6 @@ EXECUTABLES = ('calibrator', 'dlo-calibration')
 ROSDEP_KEYS = {
     'PIL': 'python3-pil',
     'cv2': 'python3-opencv',
-    'ruamel': 'python3-ruamel.yaml',
 }
 
 #: Import name of a Python library without a Debian package -> what brings it, of requirements.txt.

@@ -13,6 +13,7 @@ no file outside its own folder.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
+from functools import cache
 from pathlib import Path
 import re
 from types import MappingProxyType
@@ -123,6 +124,7 @@ class DeclaredOptions:
                 object.__setattr__(self, option.name, option.checked(getattr(self, option.name)))
 
     @classmethod
+    @cache
     def declarations(cls) -> tuple[Declaration, ...]:
         """Return the declaration of every option, in the order in which they are shown."""
         return tuple(Declaration(option.name, option.default, **option.metadata)
@@ -306,6 +308,7 @@ class Options(DeclaredOptions):
         ParameterSpace(self._names)  # refuses an empty list and a name given twice
 
     @classmethod
+    @cache
     def declarations(cls) -> tuple[Declaration, ...]:
         """Return the declaration of every option, in the order in which they are shown."""
         return (*super().declarations(), *FIXED_VALUES.values())

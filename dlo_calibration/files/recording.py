@@ -12,7 +12,6 @@ Foxglove and the library rosbags can read it.
 from __future__ import annotations
 
 from contextlib import contextmanager, suppress
-from io import StringIO
 import json
 from pathlib import Path
 from textwrap import indent
@@ -20,7 +19,7 @@ import time
 from typing import Any, BinaryIO, cast, Iterable, Iterator, Mapping
 
 import mcap  # noqa: F401  # required; its writer is slow to load, and reading does not need it
-from ruamel.yaml import YAML
+import yaml
 
 from dlo_calibration.calibration.options import recordable
 from dlo_calibration.errors import DloCalibrationError
@@ -257,11 +256,10 @@ def _qos(topic: str) -> dict[str, Any]:
             'liveliness_lease_duration': forever, 'avoid_ros_namespace_conventions': False}
 
 
+class _WithoutAliases(getattr(yaml, 'CSafeDumper', yaml.SafeDumper)):  # type: ignore[misc]
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
 def _yaml(value: Any) -> str:
-    yaml = YAML(typ='safe', pure=True)
-    yaml.default_flow_style = False
-    yaml.width = 4096
-    yaml.representer.ignore_aliases = lambda _: True
-    text = StringIO()
-    yaml.dump(value, text)
-    return text.getvalue().strip()
+    return str(yaml.dump(value, Dumper=_WithoutAliases, width=4096)).strip()

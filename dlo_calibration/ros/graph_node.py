@@ -34,8 +34,7 @@ from std_srvs.srv import Trigger
 from dlo_calibration.calibration.options import Declaration, DeclaredOptions
 from dlo_calibration.errors import DEFECT, InputError, printable
 from dlo_calibration.messages.codec import rclpy_types
-from dlo_calibration.ros.node_session import NodeSession
-from dlo_calibration.ros.parameter_file import NO_TEXTS
+from dlo_calibration.ros.node_session import NO_TEXTS, NodeSession
 
 #: Beginnings of the names of the parameters that rclpy declares itself.
 ROS_PARAMETERS = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')

@@ -14,6 +14,7 @@ from dlo_calibration.messages.codec import MessageTypes
 from dlo_calibration.messages.refusals import Refusals
 
 FAILED = 'failed'  # a state of both nodes
+NO_TEXTS = ['']  # an empty list of texts as a parameter: ROS cannot distinguish it from other empty lists
 Chosen_co = TypeVar('Chosen_co', bound=DeclaredOptions, covariant=True)
 
 

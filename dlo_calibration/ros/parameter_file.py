@@ -20,10 +20,9 @@ from typing import Mapping
 
 from dlo_calibration.calibration.options import Declaration, DeclaredOptions
 from dlo_calibration.ros.calibrator_options import CalibratorOptions
+from dlo_calibration.ros.node_session import NO_TEXTS
 from dlo_calibration.ros.planner_session import PlannerOptions
 from dlo_calibration.ros.tracker_session import TrackerOptions
-
-NO_TEXTS = ['']  # an empty list of texts as a parameter: ROS cannot distinguish it from other empty lists
 
 #: name of a node -> its options
 NODES: Mapping[str, type[DeclaredOptions]] = {

@@ -332,6 +332,7 @@ def streamed(trial, frames=90):
         replace(goal, chain=high) if k == wrong else goal for k, goal in enumerate(stream.goals)))
 
 
+@pytest.mark.long
 def test_a_few_goals_of_a_stream_are_fitted_and_all_are_judged():
     wrong, first = streamed(TRIALS[0])
     trials = (first, TRIALS[1])

@@ -133,6 +133,7 @@ def test_an_experiment_finds_the_same_parameters_whichever_trial_is_left_out():
     assert observed.options.calibrate == (*PAPER_PARAMETERS, *IN_MOTION)
 
 
+@pytest.mark.long
 def test_a_stream_between_clamps_gives_its_parameters_back():
     draft = stream()
     others = {name: 25.0 if name == 'elasticity' else 50.0 for name in PAPER_PARAMETERS}

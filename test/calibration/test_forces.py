@@ -43,6 +43,7 @@ def pulled():
     return felt_trials(2, SOFT, lifts=(LIFTS[0], PULL))
 
 
+@pytest.mark.long
 def test_forces_tell_mass_and_stiffnesses_that_nobody_told(pulled):
     result = calibrated(pulled)
     assert not result.unusable

@@ -169,6 +169,7 @@ def test_a_result_with_given_errors_of_the_hands_keeps_them(tmp_path):
     assert read_result(tmp_path / 'fixed.xml').physical()['hand_delay'] == pytest.approx(-0.08)
 
 
+@pytest.mark.long
 def test_trials_that_all_hands_missed_are_refused_in_a_sentence():
     trials, warnings = collected([
         replace(message, chain=Chain(messages()[0].chain.points)) if message.kind == GOAL else message
@@ -201,6 +202,7 @@ def test_predictions_of_recorded_actions_correct_shifted_hands():
             assert np.linalg.norm(place - its.positions[0]) < 0.005
 
 
+@pytest.mark.long
 def test_a_calibration_without_a_usable_trial_ends_with_the_reason():
     trials, _ = collected([
         replace(message, chain=Chain(messages()[0].chain.points)) if message.kind == GOAL else message

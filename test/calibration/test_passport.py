@@ -42,6 +42,7 @@ def test_a_calibration_writes_who_measured_what_and_what_calibrated_it(fitted):
     assert passport.warning == ''
 
 
+@pytest.mark.long
 def test_check_and_plan_tell_if_the_engine_is_another_one(fitted, capsys, tmp_path):
     session, path = fitted
     old = tmp_path / 'old.xml'

@@ -93,6 +93,7 @@ def test_a_rest_shape_is_recovered_where_the_trials_show_it():
         assert result.values[name] == pytest.approx(value, abs=2.0), name
 
 
+@pytest.mark.long
 def test_a_straight_dlo_stays_straight():
     straight = {'flexibility': 58.5, 'torsion': 60.0}
     result = calibrated(observed(ParameterSpace(tuple(straight)), straight), names=tuple(straight))
@@ -188,6 +189,7 @@ def climbed(monkeypatch, *logarithms):
     return [rung is ladder.best for rung in rungs].index(True)
 
 
+@pytest.mark.long
 def test_a_small_budget_leaves_the_dlo_even_and_says_so(stiff_middle):
     result = calibrated(stiff_middle, budget=13)
     assert result.space.free == EVEN.free

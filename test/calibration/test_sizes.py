@@ -48,6 +48,7 @@ def fit(thing, mass, actions=ACTIONS, **options):
         mass=mass, engine='compiled', workers=1, seed=1, **options))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('thing', [pytest.param(HOSE, id='hose'), pytest.param(CABLE, id='20 mm cable')])
 def test_the_stiffness_of_a_thick_thing_is_recovered(thing):
     values = {'elasticity': BY_NAME['elasticity'].value(thing[4]),

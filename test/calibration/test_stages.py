@@ -111,6 +111,7 @@ class Seeing(ToySimulator):
         return super().simulate(trial, physical)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(('count', 'more'), [(1, 32), (2, 32), (5, 35), (17, 34)])
 def test_initial_chains_with_other_noise_are_simulated_where_there_is_noise(count, more):
     generator = np.random.default_rng(1)

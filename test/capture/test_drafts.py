@@ -72,6 +72,7 @@ def traced(monkeypatch):
     return seen
 
 
+@pytest.mark.long
 def test_photographs_become_a_trial_and_only_changed_clicks_are_traced_again(project, traced):
     drafter = Drafter(project)
     drafts = drafter.draft()
@@ -123,6 +124,7 @@ def test_a_fault_in_one_photograph_leaves_the_other(project, edit, problem, text
     assert any(start[problem] in warning['text'] for warning in plain['trials'][0]['warnings'])
 
 
+@pytest.mark.long
 def test_a_prepared_photograph_is_used(project, monkeypatch):
     made = []
 

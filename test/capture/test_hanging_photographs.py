@@ -89,6 +89,7 @@ def test_what_is_missing_is_said(project):
         assert remedy in [warning.remedy for warning in draft.warnings if warning.level == 'error']
 
 
+@pytest.mark.long
 def test_a_further_photograph_is_a_repeat(project, photograph):
     changed(project, {'length': LENGTH, 'clamps': IN_CLAMPS})
     project.add_photograph(photograph, 'again.png')

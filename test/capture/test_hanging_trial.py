@@ -85,6 +85,7 @@ def test_stiffness_of_a_photographed_loop(tmp_path, scale):
         assert found.physical_lower < BENDING < found.physical_upper
 
 
+@pytest.mark.long
 def test_without_clicks_in_the_clamps_the_line_gives_their_direction(tmp_path):
     trials, _ = traced(tmp_path, view(), '--length', str(LENGTH))
     points = trials[0].initial.points[:, [0, 2]]
@@ -132,6 +133,7 @@ def test_what_does_not_belong_together_is_refused_in_one_line(tmp_path, capsys, 
     assert words in error and error.count('\n') == 1
 
 
+@pytest.mark.long
 def test_the_chain_of_a_loop_can_be_written_by_itself(tmp_path, capsys):
     camera = view()
     Image.fromarray(picture(camera)).save(tmp_path / 'loop.png', compress_level=1)

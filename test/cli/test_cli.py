@@ -77,6 +77,7 @@ def only_json(output):
     return json.loads(output, parse_constant=refuse)
 
 
+@pytest.mark.long
 def test_fit_prints_one_document_with_every_key(run, session):
     code, output, _ = run('fit', session, '--json')
     printed = only_json(output)
@@ -108,6 +109,7 @@ def test_flags_come_before_recorded_options_and_say_so(run, session):
     assert 'evaluations: 5 instead of 20' in errors
 
 
+@pytest.mark.long
 def test_correlations_are_between_the_parameters_by_name(run, session):
     printed = only_json(run('fit', session, '--json', '--evaluations', 150)[1])
     names = list(PAPER_PARAMETERS)
@@ -168,6 +170,7 @@ def test_fit_prints_its_result_though_the_disk_is_full(run, session, tmp_path, m
     assert only_json(output)['evaluations'] == 3
 
 
+@pytest.mark.long
 def test_a_file_that_cannot_be_written_costs_no_other_and_no_older_one(run, session, tmp_path, monkeypatch):
     folder = tmp_path / 'out'
     assert run('fit', session, '--output', folder, '--evaluations', 2)[0] == 0
@@ -201,6 +204,7 @@ def test_an_interrupt_before_the_first_evaluation_leaves_no_files(run, session, 
     assert [path for path in (tmp_path / 'out').iterdir() if path.suffix != '.mcap'] == []
 
 
+@pytest.mark.long
 def test_validate_simulates_the_result_and_fits_nothing(run, session, tmp_path):
     fitted = only_json(run('fit', session, '--json', '--output', tmp_path / 'out')[1])
     code, output, _ = run('validate', tmp_path / 'out' / 'result.xml', session, '--json')
@@ -213,6 +217,7 @@ def test_validate_simulates_the_result_and_fits_nothing(run, session, tmp_path):
     assert (printed['evaluations'], printed['simulations']) == (1, 2)
 
 
+@pytest.mark.long
 def test_check_says_that_the_same_session_agrees(run, session, tmp_path):
     run('fit', session, '--output', tmp_path / 'out')
     code, output, _ = run('check', tmp_path / 'out' / 'result.xml', session, '--json')
@@ -267,6 +272,7 @@ def test_info_says_how_many_chains_a_goal_averages(run, tmp_path):
     assert f"mean of {trial['averaged_chains']}" in run('info', tmp_path / 'stream.mcap')[1]
 
 
+@pytest.mark.long
 def test_the_goals_of_a_tracker_that_is_on_already_are_a_note_and_no_refusal(run, session, tmp_path):
     messages = session_messages(TYPES, 2)
     (_, goal), *_ = (pair for pair in messages if pair[0] == GOAL)
@@ -359,6 +365,7 @@ def test_an_option_that_is_no_parameter_of_the_search_stays_at_its_value(run, se
     assert printed['parameters']['flexibility']['value'] == pytest.approx(TRUTH['flexibility'], abs=1)
 
 
+@pytest.mark.long
 def test_stiffness_is_per_weight_unless_the_mass_is_given(run, session):
     def unit(*flags):
         printed = only_json(run('fit', session, '--json', *flags)[1])
@@ -430,6 +437,7 @@ def test_module_is_the_command(session):
     assert len(only_json(done.stdout)['trials']) == 2
 
 
+@pytest.mark.long
 def test_output_folder_may_be_that_of_the_session(run, session, tmp_path):
     copy = tmp_path / 'out' / 'session.mcap'
     run('fit', session, '--output', tmp_path / 'out')
@@ -442,6 +450,7 @@ SCENE = ('<robot name="box"><link name="box"><collision><origin xyz="5 0 0"/><ge
          '<box size="1 1 1"/></geometry></collision></link></robot>')
 
 
+@pytest.mark.long
 @pytest.mark.pybullet
 def test_a_session_with_a_scene_is_repeated_with_it(tmp_path, monkeypatch, capsys):
     """The scene is found in the session's folder, from anywhere, and named in the report."""

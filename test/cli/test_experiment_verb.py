@@ -115,6 +115,7 @@ def test_the_numbers_are_the_same_for_any_number_of_processes(run, session, tmp_
     assert first == second
 
 
+@pytest.mark.long
 def test_finished_calibrations_are_not_repeated_and_more_runs_are_added(run, session, tmp_path, undrawn):
     out, journal = tmp_path / 'out', tmp_path / 'out' / 'calibrations.jsonl'
     run(session, *SMALL, '--output', out)
@@ -148,6 +149,7 @@ def test_chosen_trials_are_held_back(run, session, tmp_path, undrawn):
     assert '--held-back 2' in printed['command']
 
 
+@pytest.mark.long
 def test_parameters_are_validated_on_another_session(run, session, tmp_path, undrawn):
     other = write_session(tmp_path / 'other.mcap', session_messages(bag_types(), 2, first=3), {'seed': 3})
     code, output, _ = run(session, '--runs', 2, '--search', 'least_squares', '--validate-on', other, '--json',
@@ -159,6 +161,7 @@ def test_parameters_are_validated_on_another_session(run, session, tmp_path, und
     assert len((tmp_path / 'out' / 'calibrations.jsonl').read_text().splitlines()) == 2
 
 
+@pytest.mark.long
 def test_sessions_of_one_name_are_distinguished(run, session, tmp_path, undrawn):
     other = write_session(tmp_path / 'other' / 'rope.mcap', session_messages(bag_types(), 3, first=2))
     printed = json.loads(run(session, other, '--runs', 1, '--search', 'random', '--evaluations', 4, '--json',

@@ -95,6 +95,7 @@ def test_every_option_says_what_it_belongs_to():
     assert inspect.signature(type(DECLARED[0])).parameters['of'].default is inspect.Parameter.empty
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('write', [session_file, request_file, result_file])
 def test_options_of_the_machine_never_come_from_a_file(write, tmp_path, as_an_attacker, reached, capsys):
     """All at once: the test above makes sure that these are all."""

@@ -49,6 +49,7 @@ def written(folder):
     return sorted(file.name for file in folder.iterdir())
 
 
+@pytest.mark.long
 def test_session_alone_gives_a_picture_per_trial(run, session, tmp_path):
     code, output, notes = run('plot', session, '--output', tmp_path / 'pictures')
     assert (code, output) == (0, '')

@@ -143,6 +143,7 @@ def test_other_options_are_refused_and_those_of_the_machine_are_not(words, part,
     assert names(out) == FINISHED
 
 
+@pytest.mark.long
 def test_a_session_that_is_named_again_must_have_the_same_trials(session, tmp_path, act, abandon):
     out = tmp_path / 'out'
     abandon(10, 'fit', session, '--output', out, *FLAGS)
@@ -189,6 +190,7 @@ def test_an_empty_folder_or_no_session_is_refused_in_one_line(tmp_path, act):
                               'name it, or --resume DIR\n')
 
 
+@pytest.mark.long
 def test_ctrl_c_gives_a_result_and_keeps_what_is_needed_to_go_on(session, tmp_path, act):
     whole = act('fit', session, '--output', tmp_path / 'whole', *FLAGS)
     out = tmp_path / 'out'

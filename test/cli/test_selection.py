@@ -130,6 +130,7 @@ def test_an_interrupted_fit_goes_on_with_the_same_trials(source, session, own, t
     assert values == read_result(whole).values
 
 
+@pytest.mark.long
 def test_topics_with_other_names_are_read_and_written_with_ours(session, own, tmp_path, act):
     assert numbers(act, own, *REMAP) == numbers(act, session)
     expected = json.loads(act('fit', session, *FEW, '--json')[1])['parameters']

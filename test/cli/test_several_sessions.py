@@ -45,6 +45,7 @@ def fit(capsys):
     return fit
 
 
+@pytest.mark.long
 def test_each_session_gets_a_value_of_its_own(fit, sessions):
     code, printed, _ = fit(*sessions, '--own', 'friction')
     assert code == 0
@@ -87,6 +88,7 @@ def test_a_film_and_a_session_of_a_robot_are_calibrated_together(fit, sessions, 
         assert (options['slow_chain_error'], options['slow_hand_error']) == (0.0005, 0.002)
 
 
+@pytest.mark.long
 def test_an_interrupted_calibration_of_several_sessions_goes_on(fit, sessions, tmp_path):
     class Dying(ToySimulator):
         count = 0
@@ -104,6 +106,7 @@ def test_an_interrupted_calibration_of_several_sessions_goes_on(fit, sessions, t
     assert resumed['parameters'] == fit(*sessions, '--own', 'friction')[1]['parameters']
 
 
+@pytest.mark.long
 def test_impossible_sessions_are_refused(fit, sessions, tmp_path):
     code, _, said = fit(sessions[0], '--own', 'friction')
     assert code == 2

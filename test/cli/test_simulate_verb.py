@@ -98,6 +98,7 @@ def test_json_has_the_actions_of_all_trials(run, request_of):
     assert predicted[10, 1] == pytest.approx(0.1, abs=0.01)
 
 
+@pytest.mark.long
 def test_folder_gets_pictures_animations_and_chains(run, request_of, tmp_path, monkeypatch):
     few_frames(monkeypatch)
     folder = tmp_path / 'new' / 'folder'
@@ -176,6 +177,7 @@ def test_more_points_than_a_dlo_has_are_refused(run, request_of):
     assert (code, output) == (2, '') and '1001 points; expected at most 1000; leave some' in notes
 
 
+@pytest.mark.long
 def test_many_points_and_any_name(run, request_of, tmp_path, monkeypatch):
     few_frames(monkeypatch)
     path = request_of([PLACE], start=straight(500), name='../$_{\u202e[red]')

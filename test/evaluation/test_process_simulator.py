@@ -74,6 +74,7 @@ def test_rollouts_and_errors_are_those_of_the_simulator_itself():
     assert (process != os.getpid(), nice) == (True, min(os.nice(0) + 5, 19))
 
 
+@pytest.mark.long
 def test_pybullet_gives_the_same_rollouts_in_its_process(scene):
     bullet = pytest.importorskip('dlo_calibration.simulation.bullet')
     options = Options(engine='bullet', scene=scene, nodes=9, settle_limit=0.1, time_step=0.01)
@@ -108,6 +109,7 @@ def test_an_idle_process_that_died_is_replaced():
         assert tried(away).residuals is not None
 
 
+@pytest.mark.long
 def test_a_hanging_process_is_replaced_and_a_slow_one_is_not(monkeypatch):
     monkeypatch.setattr('dlo_calibration.evaluation.process_simulator.DEATHS', 1)
     with closing(in_process(Hanging, limit=1.0)) as away:
@@ -127,6 +129,7 @@ def test_a_stop_ends_a_rollout_in_its_middle():
         assert not simulating(os.getpid())
 
 
+@pytest.mark.long
 def test_each_thread_has_a_process():
     with closing(in_process(Slow)) as away, closing(Threads(2)) as threads:
         begun = Pool(away, threads).begin([a_job(), a_job()])
@@ -147,6 +150,7 @@ class Second:
         return ProcessSimulator('second', self.kind, 'trials', **self.rest) if second else ToySimulator()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('kind, limit, ending', [
     (Dying, 60.0, 'ended unexpectedly with exit code 3; free memory, or use fewer workers'),
     (AlwaysHanging, 1.0, 'gave no answer for 1 s and is replaced; raise answer_limit')])
@@ -171,6 +175,7 @@ away.simulate(*a_job(95.0))
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(('kind', 'limit'), [('Slow', 60.0), ('Hanging', 2.0)])
 def test_kill_9_of_the_parent_leaves_no_process_behind(kind, limit):
     parent = subprocess.Popen(
@@ -186,6 +191,7 @@ def test_kill_9_of_the_parent_leaves_no_process_behind(kind, limit):
     wait_until(lambda: not Path(f'/proc/{child}').exists())
 
 
+@pytest.mark.long
 def test_a_program_that_ends_without_closing_does_not_wait():
     program = PROGRAM.format(kind='Slow', limit=60.0)
     subprocess.run([sys.executable, '-c', program], cwd=ROOT, stdout=subprocess.DEVNULL, check=True,

@@ -68,6 +68,7 @@ def test_every_run_calibrates_on_all_trials_and_without_each_that_is_held_back()
     assert tasks[0].judges.trials == ()
 
 
+@pytest.mark.long
 def test_a_calibration_gives_the_result_of_the_library():
     done = perform(task(search='least_squares', seed=3), toy)
     trials = toy_trials(3)
@@ -104,6 +105,7 @@ def test_a_trial_judges_with_the_calibrated_parts():
     assert seen[0]['stiffness_2'] == BY_NAME['stiffness_2'].physical(75.0)
 
 
+@pytest.mark.long
 def test_the_judging_trial_does_not_change_the_parameters():
     trials = list(toy_trials(3))
     other = trials[1]

@@ -269,6 +269,7 @@ def test_a_database_that_computes_its_messages_is_refused_and_evaluates_nothing(
         assert 'may compute its content' in text and 'the tables of rosbag2' in text
 
 
+@pytest.mark.long
 def test_a_small_database_with_endless_rows_is_left_after_seconds(tmp_path):
     path, levels, size = tmp_path / 'a.db3', 8, 4096
     root = database(path)

@@ -310,6 +310,7 @@ def file(tmp_path):
     return path
 
 
+@pytest.mark.long
 def test_fit_of_a_request_gives_what_the_library_gives(command, file):
     code, output, _ = command('fit', file, '--json')
     printed = json.loads(output)
@@ -319,6 +320,7 @@ def test_fit_of_a_request_gives_what_the_library_gives(command, file):
     assert (printed['trials'], printed['evaluations'], printed['score']) == (2, 20, result.best.score)
 
 
+@pytest.mark.long
 def test_fit_of_a_request_writes_its_files_and_validate_takes_it(command, file, tmp_path):
     code, output, errors = command('fit', file, '--json', '--evaluations', 5, '--output', tmp_path / 'out')
     assert code == 0

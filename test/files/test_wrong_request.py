@@ -37,6 +37,7 @@ def goals_without_initial_chain(types):
     return [pair for pair in session_messages(types, 1) if pair[0] != INITIAL]
 
 
+@pytest.mark.long
 def test_goals_without_initial_chain_wait_visibly_and_are_refused_once_when_one_comes_later(
         ros_environment, tmp_path):
     with live_node(ros_environment, tmp_path) as robot:
@@ -349,6 +350,7 @@ def recorded_octets(tmp_path_factory):
     return file.read_bytes()
 
 
+@pytest.mark.long
 @drawing(8, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(place=st.floats(0, 1), octets=st.binary(max_size=9))
 def test_cut_or_damaged_file_ends_in_a_result_or_one_line(

@@ -135,6 +135,7 @@ def engines(second):
     return lambda options: second if options.engine == 'bullet' else ToySimulator()
 
 
+@pytest.mark.long
 def test_auto_confirms_and_a_named_engine_does_not():
     trials = toy_trials(1)
     result = calibrate(trials, OPTIONS, make_simulator=engines(SecondToy(0.001)))
@@ -223,6 +224,7 @@ def test_fit_and_validate_print_both_engines(command, tmp_path):
     assert command('fit', '--engine', 'compiled')['confirmation'] is None
 
 
+@pytest.mark.long
 def test_sentences_name_the_confirmation(tmp_path):
     before, after = calibrated(SecondToy(0.004))
     assert dict(fit_facts(plain(after)))['confirmed by second toy'].endswith(

@@ -56,6 +56,7 @@ def test_parts_of_different_stiffness_are_named():
     assert 'set parts to 0' in sentences(result)[-1]
 
 
+@pytest.mark.long
 def test_residuals_that_are_noise_need_no_explanation():
     result = calibrated(observed(EVEN, TRUTH))
     assert result.missing_parameters == ()

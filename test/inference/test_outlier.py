@@ -56,6 +56,7 @@ def test_no_trial_of_a_sample_is_an_outlier(session):
     assert calibrated(session, session.trials).outlier is None
 
 
+@pytest.mark.long
 def test_an_outlier_is_named_with_the_values_without_it(session):
     trials = list(session.trials)
     goal = trials[1].goals[-1]
@@ -72,6 +73,7 @@ def test_an_outlier_is_named_with_the_values_without_it(session):
     assert bool(result.unusable) == bool(result.outlier.decided)
 
 
+@pytest.mark.long
 def test_a_result_that_an_outlier_decides_is_not_usable(session):
     result = calibrated(session, session.trials)
     estimate = result.parameters['flexibility']
@@ -83,6 +85,7 @@ def test_a_result_that_an_outlier_decides_is_not_usable(session):
     assert '--without 2' in words
 
 
+@pytest.mark.long
 def test_goals_from_the_other_end_are_named_as_such(session):
     trials = list(session.trials)
     goal = trials[1].goals[-1]
@@ -118,6 +121,7 @@ def test_the_spread_without_a_trial_is_that_of_a_linear_model():
         100 * spread)
 
 
+@pytest.mark.long
 def test_a_sensitive_outlier_widens_intervals_but_decides_nothing(session):
     result = calibrated(session, session.trials)
     point = result.best.point.copy()

@@ -227,6 +227,7 @@ def collected(messages):
     return collector
 
 
+@pytest.mark.long
 @drawing(25)
 @given(messages=st.lists(mutations('world'), min_size=1, max_size=6))
 def test_mutated_bytes_are_collected_or_refused(messages):

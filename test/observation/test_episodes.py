@@ -80,6 +80,7 @@ def test_two_movements_make_two_episodes():
     assert all('7.0' in problem or '6.9' in problem or '7.1' in problem for problem in problems)
 
 
+@pytest.mark.long
 def test_the_tag_is_where_it_was_when_the_hand_held_the_dlo_before():
     # The second movement is the same for all points nearby: alone, it leaves the place open.
     first = filmed_hand(0.3)

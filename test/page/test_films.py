@@ -79,6 +79,7 @@ def start_of_trial(state):
     return trial['start']
 
 
+@pytest.mark.long
 def test_a_film_is_kept_played_and_removed(tmp_path, short):
     with served(tmp_path / 'project') as page:
         answer = page.done('POST', 'api/films', short.read_bytes(), {'X-Name': 'my%20film.mp4'})

@@ -172,6 +172,7 @@ def test_a_result_from_a_stranger_is_ignored_if_it_is_damaged(tmp_path, content)
     assert (calibration.state, calibration.plain_result('')) == ('idle', None)
 
 
+@pytest.mark.long
 def test_the_information_of_each_trial_is_shown_before_a_calibration(tmp_path, monkeypatch):
     monkeypatch.setattr(information, 'LiveInformation', ToyInformation)
     with served(tmp_path, '--calibrate', 'flexibility', appraising=True) as page:
@@ -184,6 +185,7 @@ def test_the_information_of_each_trial_is_shown_before_a_calibration(tmp_path, m
         assert state['calibration']['state'] == 'idle'
 
 
+@pytest.mark.long
 def test_a_calibration_can_be_stopped_and_gives_the_best_so_far(tmp_path):
     with served(tmp_path, simulator=lambda: ToySimulator(seconds=0.02)) as page:
         whole_trial(page)
@@ -209,6 +211,7 @@ def test_trials_are_compared_with_an_earlier_result(finished):
     assert page.refused('POST', 'api/check', b'x' * 3_000_000)[0] == 413
 
 
+@pytest.mark.long
 def test_a_calibration_that_fails_says_why(tmp_path):
     with served(tmp_path, simulator=lambda: ToySimulator(crash=True)) as page:
         whole_trial(page)
@@ -317,6 +320,7 @@ def test_an_incomplete_trial_is_not_calibrated(shared):
     assert shared.refused('POST', 'api/calibrate', {'workers': 3})[0] == 400
 
 
+@pytest.mark.long
 def test_clicks_beside_the_rope_or_outside_the_photograph_are_refused_or_unsure(tmp_path):
     with served(tmp_path) as page:
         empty = page.add(drawn(None))

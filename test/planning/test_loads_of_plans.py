@@ -61,6 +61,7 @@ def test_loads_become_json_and_the_radius_of_a_straight_dlo_is_null():
     assert plain_plan(without)['actions'][0]['most_tension_n'] is None
 
 
+@pytest.mark.long
 def test_a_plan_bends_the_dlo_no_more_sharply_than_permitted():
     goal = Chain(simulate(DLO, straight(), [FOLDED], options=QUICK, draws=0).steps[0].chain)
     free = plan(DLO, straight(), goal, ONE, simulation=QUICK)
@@ -79,6 +80,7 @@ def test_a_plan_bends_the_dlo_no_more_sharply_than_permitted():
     assert any(words in warning for warning in gentle.warnings)
 
 
+@pytest.mark.long
 def test_a_plan_pulls_no_harder_than_permitted():
     goal = Chain(simulate(DLO, straight(), [FOLDED], options=QUICK, draws=0).steps[0].chain)
     free = plan(DLO, straight(), goal, ONE, simulation=QUICK)

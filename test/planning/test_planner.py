@@ -190,6 +190,7 @@ def test_hands_stay_within_their_reach():
     assert alone.actions
 
 
+@pytest.mark.long
 def test_the_dlo_keeps_out_of_a_no_go_box_on_its_way():
     goal = Chain(straight().points + [0.0, 0.12, 0.0])
     box = '-0.05 0.04 -1 0.05 0.08 1'

@@ -132,6 +132,7 @@ def test_a_dlo_is_led_around_a_post_as_the_goal_lies(scene_of, monkeypatch):
     assert any('another side than in the goal' in warning for warning in carried.warnings)
 
 
+@pytest.mark.long
 def test_a_hand_goes_around_a_post_or_over_it_where_the_dlo_need_not(scene_of):
     """The post is beside the DLO, on the straight way of the gripped end."""
     goal = Chain(arc(0.8).points)
@@ -169,6 +170,7 @@ def test_a_dlo_is_laid_into_a_clip_and_pulled_straight(scene_of):
     assert min(distances(ways(result), place).min() for place in places) >= CLEARANCE - 1e-5
 
 
+@pytest.mark.long
 def test_hands_come_as_near_to_a_body_as_the_dlo_that_lies_on_it(scene_of):
     plate = box((2.0, 2.0, 0.1), (0.0, 0.0, -0.05))
     result = plan(DLO, straight(), GOAL, ONE, simulation=Options(scene=scene_of(plate), table=False))

@@ -55,12 +55,14 @@ def simulated(image):
     return int((np.abs(image - ImageColor.getrgb(SIMULATED)).sum(axis=2) < 30).sum())
 
 
+@pytest.mark.long
 def test_simulated_chain_is_drawn_where_there_is_one():
     trial, = toy_trials(1)
     assert simulated(pixels(trial, None)) == 0
     assert simulated(pixels(trial, chains_of(trial, 0.05))) > 500
 
 
+@pytest.mark.long
 def test_picture_of_a_session_has_a_row_per_trial(tmp_path):
     trials = toy_trials(2)
     session_picture(trials[:1], [chains_of(trials[0])], tmp_path / 'one.png')
@@ -78,6 +80,7 @@ def test_picture_does_not_depend_on_what_was_drawn_before():
     assert trial_png(first, chains_of(first)) == once
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('trial', [
     tracked(40),
     Trial('straight up', Chain([[0, 0, 0], [0, 0, 1], [0, 0, 2.0]]),

@@ -132,6 +132,7 @@ def test_a_request_to_stop_says_that_nothing_is_calibrated_and_advice_goes_on(as
     assert asked.advised(2)
 
 
+@pytest.mark.long
 def test_advice_goes_on_when_the_clock_went_back(tracked):
     for count, (start, points) in enumerate(((1000, START), (10, GOAL_POINTS)), 1):
         for stamp in (start, start + 1):
@@ -141,6 +142,7 @@ def test_advice_goes_on_when_the_clock_went_back(tracked):
         assert tracked.advised(count)
 
 
+@pytest.mark.long
 def test_one_stamp_from_the_future_does_not_silence_advice(tracked):
     now = tracked.now
     tracked.now += 1000 * SECOND

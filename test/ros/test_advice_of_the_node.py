@@ -41,6 +41,7 @@ def advised(graph, count):
     return graph.heard['advice'][-1]
 
 
+@pytest.mark.long
 def test_advice_comes_for_the_first_chain_and_after_a_trial(start):
     graph = start(wanted='flexibility 0.01', height=0.08)
     messages = session_messages(TYPES, 1)

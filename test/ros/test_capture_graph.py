@@ -58,6 +58,7 @@ CAMERA_INFO = {'width': 400, 'height': 300, 'distortion_model': 'plumb_bob', 'd'
                'k': [440.0, 0.0, 200.0, 0.0, 450.0, 150.0, 0.0, 0.0, 1.0]}
 
 
+@pytest.mark.long
 def test_photographs_come_from_topics_with_the_lens_of_their_camera(ros_environment, tmp_path):
     image, compressed = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
     with publishing(ros_environment, [

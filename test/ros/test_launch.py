@@ -14,7 +14,7 @@ from types import ModuleType, SimpleNamespace
 
 from made_up_dlo import made_up_plan
 import pytest
-from ruamel.yaml import YAML
+import yaml
 
 from dlo_calibration.errors import InputError
 from dlo_calibration.evaluation.evaluation import Evaluation
@@ -200,7 +200,7 @@ def test_ros2_launch_knows_the_launch_file(node, install):
 
 def rviz_displays(node):
     text = (ROOT / 'config' / f'{node}.rviz').read_text(encoding='utf-8')
-    return YAML(typ='safe').load(text)['Visualization Manager']['Displays']
+    return yaml.safe_load(text)['Visualization Manager']['Displays']
 
 
 def test_rviz_shows_topics_of_the_contract_with_displays_of_their_types(node):

@@ -171,6 +171,7 @@ def test_best_effort_publishers_are_heard(start_node, ros_environment):
     robot.until_status(trials='2')
 
 
+@pytest.mark.long
 def test_burst_of_goal_chains_arrives_whole(start_node, tmp_path):
     robot = start_node(evaluations=3)
     initial, action, (_, goal) = session_messages(TYPES, 1)
@@ -186,6 +187,7 @@ def test_burst_of_goal_chains_arrives_whole(start_node, tmp_path):
     assert sum(record.name == GOAL for record in session.records) == 500
 
 
+@pytest.mark.long
 def test_starts_by_itself_after_enough_trials(start_node):
     robot = start_node(start_after_trials=2)
     robot.send(session_messages(TYPES, 1))
@@ -326,6 +328,7 @@ def test_bad_command_line_ends_the_process(ros_environment, tmp_path):
     assert one_line(errors)
 
 
+@pytest.mark.long
 def test_messages_dropped_in_a_flood_are_counted_and_reported(start_node, tmp_path, capsys):
     robot = start_node()
     initial, action, (_, goal) = session_messages(TYPES, 1)

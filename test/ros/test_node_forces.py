@@ -40,6 +40,7 @@ def session(tmp_path_factory):
     return path
 
 
+@pytest.mark.long
 def test_a_robot_in_another_process_publishes_wrenches_and_the_recording_replays(
         ros_environment, tmp_path, session, capsys):
     with robot_of(ros_environment) as robot:

@@ -131,6 +131,7 @@ def test_requests_that_do_not_fit_are_refused_and_stop_gives_the_best_so_far(sta
     assert 'the search has not reached a minimum (stopped on request)' in result['unusable']
 
 
+@pytest.mark.long
 def test_reset_forgets_the_trials_and_begins_another_session(start, tmp_path, command):
     graph = start()
     graph.send(session_messages(TYPES, 2))
@@ -211,6 +212,7 @@ def test_a_stream_of_refusals_changes_the_status_at_most_once_a_second(start):
     assert graph.status['trials'] == '1'
 
 
+@pytest.mark.long
 def test_a_discarded_trial_is_left_out_by_the_replay_too(start, tmp_path, command):
     graph = start()
     assert graph.session.request('discard_last') == (
@@ -291,6 +293,7 @@ def test_starts_by_itself_at_once_when_one_more_trial_is_complete(start):
     assert graph.status['state'] == 'calibrating'
 
 
+@pytest.mark.long
 def test_failure_of_the_engine_reaches_status_and_the_session_goes_on(start):
     toy = ToySimulator(crash=True)
     graph = start(toy)
@@ -462,6 +465,7 @@ def test_description_of_the_dlo_is_the_text_of_the_result_file(start, tmp_path):
     assert text == (folder / 'result.xml').read_text(encoding='utf-8')
 
 
+@pytest.mark.long
 def test_markers_show_trials_at_intervals_and_then_the_simulation(start):
     graph = start()
 
@@ -488,6 +492,7 @@ def test_markers_show_trials_at_intervals_and_then_the_simulation(start):
     assert not any(shown())
 
 
+@pytest.mark.long
 def test_status_says_whether_a_trial_added_information(start, tmp_path, command):
     graph = start(seed=3)
     graph.send(session_messages(TYPES, 1))
@@ -548,6 +553,7 @@ def back(pairs, seconds=5):
     return pairs
 
 
+@pytest.mark.long
 def test_a_clock_that_went_back_begins_another_session_and_trials_never_mix(start, tmp_path, command):
     graph = start()
     graph.send(session_messages(TYPES, 2))
@@ -596,6 +602,7 @@ def test_initial_chains_of_a_clock_that_went_back_are_forgotten_without_another_
     assert len(read_session(folder).trials) == 1
 
 
+@pytest.mark.long
 def test_log_times_never_go_back_though_the_clock_of_the_machine_does(start, tmp_path, monkeypatch):
     graph = start()
     graph.send(session_messages(TYPES, 1))
@@ -612,6 +619,7 @@ def unfinished(path):
     return list(path.glob('dlo_unfinished_*'))
 
 
+@pytest.mark.long
 def test_another_session_goes_on_with_the_same_trials_and_options(start, tmp_path):
     """Whoever sends the trials of an interrupted session again need not wait for its evaluations again."""
     toys, results = [CountingToy() for _ in range(3)], []
@@ -646,6 +654,7 @@ def test_another_session_goes_on_with_the_same_trials_and_options(start, tmp_pat
     assert repr(result_values(results[1])) == repr(result_values(results[2]))
 
 
+@pytest.mark.long
 def test_without_a_log_it_calibrates_all_the_same_and_says_so(start, tmp_path):
     graph = start()
     graph.send(session_messages(TYPES, 1))

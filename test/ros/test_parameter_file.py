@@ -8,10 +8,11 @@ import subprocess
 import sys
 
 import pytest
-from ruamel.yaml import YAML
+import yaml
 
 from dlo_calibration.ros.calibrator_options import CalibratorOptions
-from dlo_calibration.ros.parameter_file import NO_TEXTS, NODES, parameter_file
+from dlo_calibration.ros.node_session import NO_TEXTS
+from dlo_calibration.ros.parameter_file import NODES, parameter_file
 
 ROOT = Path(__file__).resolve().parents[2]
 FILE = ROOT / 'config' / 'calibrator.yaml'
@@ -29,7 +30,7 @@ def test_file_is_what_the_documented_command_makes():
 
 @pytest.mark.parametrize('node, kind', NODES.items(), ids=NODES)
 def test_file_has_every_parameter_with_its_default(node, kind):
-    values = YAML(typ='safe').load(parameter_file(node))['/**']['ros__parameters']
+    values = yaml.safe_load(parameter_file(node))['/**']['ros__parameters']
     assert list(values) == [declaration.name for declaration in kind.declarations()]
     for declaration in kind.declarations():
         value = values[declaration.name]

@@ -98,6 +98,7 @@ def test_a_new_table_height_applies_to_the_next_messages(ros_environment, tmp_pa
         assert 'trial 2' not in robot.status['last_refusal']
 
 
+@pytest.mark.long
 def test_a_stream_is_collected_anew_while_services_answer_and_a_start_waits_for_it(
         ros_environment, tmp_path, monkeypatch):
     from rclpy.parameter import Parameter

@@ -148,6 +148,7 @@ def test_without_points_nothing_is_tracked_and_start_says_what_is_missing(graph)
     assert 'points' in answer
 
 
+@pytest.mark.long
 def test_stop_rests_and_start_finds_the_dlo_anew(graph):
     node = graph(points=points())
     node.session.status_period = 0.0

@@ -186,6 +186,7 @@ def test_a_budget_that_ends_within_a_measurement_leaves_a_whole_model():
     assert all(model.jacobian.any(axis=0).all() for model in models)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('name, seed', [('object1', 19), ('object3', 10), ('object5', 2)])
 def test_a_descent_does_not_stall_in_the_valley_that_a_missing_lift_leaves(name, seed):
     """Without the lift of trial 3, a DLO shows little more than the ratio of stiffness to friction."""

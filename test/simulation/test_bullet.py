@@ -120,6 +120,7 @@ def test_a_rope_laid_over_a_peg_hangs_over_it(scene, among, radius):
     assert chain[[0, -1], 2].max() < 0.1
 
 
+@pytest.mark.long
 def test_a_rope_falls_onto_the_box_of_a_scene_and_onto_the_table(scene, among):
     simulator = among(scene(BOX.format(friction=1.0).replace('0.2 0.4 0.2', '0.16 0.4 0.2')))
     chain = simulator.simulate(dropped(0.25), {**PHYSICAL, 'flexibility': 1e-5}).chains[0]
@@ -169,6 +170,7 @@ MESH = ('<robot name="m"><link name="m"><collision><geometry><mesh filename="mes
         '</collision></link></robot>')
 
 
+@pytest.mark.long
 def test_a_hollow_mesh_is_hollow(scene, among):
     """A rope falls into a trough, which the convex hull of its mesh would cover."""
     vertices = [(x, y, z) for x in (0.0, 0.6) for y, z in ((-0.2, 0.3), (0.0, 0.1), (0.2, 0.3))]

@@ -62,6 +62,7 @@ def test_every_kind_of_film_gives_its_images_and_their_times(folder, suffix, cod
     assert (colours[0][2] < 100, colours[1][0] < 100) == (True, True)
 
 
+@pytest.mark.long
 def test_a_film_is_read_again_from_a_time_and_backwards(mp4, monkeypatch):
     film = read_film(mp4)
     assert len(list(film)) == len(list(film)) == COUNT

@@ -55,6 +55,7 @@ def test_the_line_is_the_middle_of_the_dlo(changed):
     assert seen / 1.4 < trace.width < seen * 1.4
 
 
+@pytest.mark.long
 def test_points_are_evenly_spaced_from_the_first_click_to_the_last():
     example = scene(5, SIZE, off=OFF, **PLAIN)
     pixels = picture(example)
@@ -67,6 +68,7 @@ def test_points_are_evenly_spaced_from_the_first_click_to_the_last():
     assert not trace.pixels.flags.writeable and not trace.sure.flags.writeable
 
 
+@pytest.mark.long
 def test_a_loop_is_followed_straight_on_and_its_crossing_is_reported():
     example = scene(11, SIZE, off=OFF, **{**PLAIN, 'loops': 1, 'radius': 0.003})
     trace, points, _ = trace_errors(example)
@@ -84,6 +86,7 @@ def test_a_loop_is_followed_straight_on_and_its_crossing_is_reported():
     assert crossing.first_above is not True  # the later part lies above
 
 
+@pytest.mark.long
 def test_a_part_can_be_traced():
     example = scene(8, SIZE, off=OFF, **PLAIN)
     inner = example.camera.project(example.curve[[150, 300, 450]])
@@ -180,6 +183,7 @@ def test_no_other_columns_have_a_larger_sum():
         assert mean == pytest.approx(sums[best] / 6)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('more', [1, 2])
 def test_clicks_that_are_off_by_a_hundredth_of_the_picture_change_nothing(more):
     example = scene(11, SIZE, off=0.0, **{**PLAIN, 'radius': 0.004})

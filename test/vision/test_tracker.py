@@ -100,6 +100,7 @@ def test_time_can_run_backwards():
     assert np.nanmax(errors(tracked(curves)[-1], curves[-1])) < FAR
 
 
+@pytest.mark.long
 def test_what_a_hand_hides_is_not_a_number_and_the_rest_is_right():
     curves = [bent(0.5)] * 10
     hands = [(Hand((0.25, -0.13 + 0.03 * k)),) for k in range(10)]
@@ -249,6 +250,7 @@ def test_blur_is_no_obstacle():
     assert np.nanmax(errors(found[-1], curves[-1])) < 2 * FAR
 
 
+@pytest.mark.long
 def test_a_dlo_that_is_covered_is_lost_with_a_reason_and_found_again():
     curves = [bent(0.4)] * 12
     covered = range(3, 6)

@@ -46,6 +46,7 @@ def error(scale, camera=CAMERA):
     return float(np.linalg.norm(found - BOARD.seen_from(PLACES), axis=1).max())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('order', [(0, 0.3, 0.6, 0.8, 1.0, 0.7, 0.2, 0), (0.5, 0.7, 1.0, 0.6, 0.1, 0)])
 def test_an_arm_before_the_board_does_not_move_a_camera_that_stands(order):
     finder = BoardFinder(LENS)
@@ -54,6 +55,7 @@ def test_an_arm_before_the_board_does_not_move_a_camera_that_stands(order):
     assert len({id(scale) for scale in scales}) == 1
 
 
+@pytest.mark.long
 def test_a_camera_in_the_hand_is_followed_or_its_view_is_unknown():
     finder = BoardFinder(LENS)
     known = []

@@ -58,6 +58,7 @@ def test_a_changed_parameter_is_named(name, factor):
     assert any(f'{name} has changed' in words for words in found.words)
 
 
+@pytest.mark.long
 def test_the_same_dlo_agrees():
     found = check(session(8))
     assert found.verdict == AGREES

@@ -109,6 +109,7 @@ def test_two_calibrations_do_not_share_a_folder(source, tmp_path):
             CalibrationFolder(tmp_path)
 
 
+@pytest.mark.long
 def test_the_names_of_result_files_stand_in_one_place():
     package = Path(folder_module.__file__).parents[1]
     places = {file.relative_to(package).as_posix() for file in package.rglob('*.py')

@@ -38,6 +38,7 @@ def asked(**limits):
 FIRST = functools.cache(asked)
 
 
+@pytest.mark.long
 def test_the_first_action_is_expected_to_tell_what_is_wanted_and_is_the_same_each_time():
     first, again = FIRST(), asked()
     assert first.words == again.words
@@ -48,6 +49,7 @@ def test_the_first_action_is_expected_to_tell_what_is_wanted_and_is_the_same_eac
     assert first.trials >= 1 and not first.reached
 
 
+@pytest.mark.long
 def test_an_action_keeps_to_the_reach_of_its_hand_the_kinds_and_the_height():
     action = asked(kinds=['grasp_and_place'], reach_1='box 0.25 -0.1 -1 0.7 0.1 1', height=0.03).action
     hand, = action.hands
@@ -57,6 +59,7 @@ def test_an_action_keeps_to_the_reach_of_its_hand_the_kinds_and_the_height():
     assert np.ptp(dragged.positions[:, 2]) < 0.005
 
 
+@pytest.mark.long
 def test_the_hands_wait_before_they_open():
     first = asked(pause=1.5)
     begin, end = first.pause
@@ -79,6 +82,7 @@ def known(std, trials=()):
         before.uncertainty, std=std, covariance=np.diag(std**2), scale=1e-3)), trials)
 
 
+@pytest.mark.long
 def test_it_ends_when_each_wanted_parameter_is_certain_enough():
     certain = [0.01, 0.28, 0.02, 0.28]
     limits = AdviceOptions(**QUICK, wanted=BOTH)
@@ -89,6 +93,7 @@ def test_it_ends_when_each_wanted_parameter_is_certain_enough():
     assert told.reached and told.action is None
 
 
+@pytest.mark.long
 def test_it_says_after_two_trials_what_the_hands_cannot_show():
     """A DLO that may not be laid over itself does not show how thick it is."""
     limits = AdviceOptions(**QUICK, wanted=f'{BOTH}, self_collision 5')
@@ -100,6 +105,7 @@ def test_it_says_after_two_trials_what_the_hands_cannot_show():
     assert 'self_collision: ± 46.1 of 100 now' in told.words
 
 
+@pytest.mark.long
 def test_a_dlo_out_of_reach_is_only_tidied():
     """A hand reaches little of the DLO: whatever it would learn, the DLO must come into its reach first."""
     told = asked(reach_1='box 0.45 -0.4 -1 1.3 0.4 1')

@@ -79,6 +79,7 @@ def test_a_page_that_cannot_be_written_is_reported_once(result, tmp_path, withou
     assert list(reporter.failures()) == []
 
 
+@pytest.mark.long
 def test_a_drawing_process_that_is_killed_costs_the_page_only(result, tmp_path, monkeypatch):
     monkeypatch.setattr(report_writer, 'page_of', kill_this_process)
     reporter = ReportWriter(lambda _: ToySimulator())
@@ -88,6 +89,7 @@ def test_a_drawing_process_that_is_killed_costs_the_page_only(result, tmp_path, 
     assert why == 'the process that draws it was ended from outside'
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('responsive', [False, True])
 def test_pictures_are_drawn_in_another_process_only_if_this_one_must_be_responsive(
         result, tmp_path, monkeypatch, responsive):
