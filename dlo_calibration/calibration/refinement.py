@@ -11,7 +11,7 @@ its Jacobian; only the columns of new parameters are added.
 from __future__ import annotations
 
 from concurrent.futures import CancelledError
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 import math
 from operator import itemgetter
@@ -60,6 +60,21 @@ BEGINNINGS = (0.03, 0.1, 0.3)  # m; bend radii from the best of which a search o
 Finer = Callable[[ParameterSpace, Floats], tuple[ParameterSpace, Floats]]
 
 
+@dataclass(frozen=True)
+class Rung:
+    """
+    A step of a ladder towards a finer DLO.
+
+    :param name: of what is tried, in words.
+    :param finer: how it refines a space.
+    :param aside: whether the next rung begins below it where it is not kept, which then is no failure.
+    """
+
+    name: str
+    finer: Finer
+    aside: bool = False
+
+
 def refine(setting: Setting, uniform: Fit, budget: int) -> Fit:
     """
     Add knots to the rest shape, also with locking, then halve all parts, while cross-validation improves.
@@ -90,9 +105,9 @@ def refine(setting: Setting, uniform: Fit, budget: int) -> Fit:
     ladder, words = _Ladder(setting, uniform, budget, level), []
     if _shows_rest_shape(trials, space):
         twist = clamp_twist(trials)
-        rungs: list[tuple[int | None, Finer]] = [
-            (knots, partial(_with_knots, knots, twist)) for knots in KNOTS if knots > space.knots]
-        bends: tuple[None, Finer] = None, _with_bends
+        rungs = [Rung(str(knots), partial(_with_knots, knots, twist))
+                 for knots in KNOTS if knots > space.knots]
+        bends = Rung('bends', _with_bends, aside=True)
         rungs = [*rungs[:1], bends, *rungs[1:], bends]
         why = ladder.climb(rungs)
         if may_lock(space):
@@ -103,7 +118,7 @@ def refine(setting: Setting, uniform: Fit, budget: int) -> Fit:
         words.append((f'rest shape with {knots} knots' if knots else 'straight') + at_clamps + why)
     even = ladder.best
     counts = [space.parts * 2**k for k in range(1, 4) if space.parts * 2**k <= MOST_PARTS]
-    halved = [(count, partial(_with_parts, count)) for count in counts]
+    halved = [Rung(str(count), partial(_with_parts, count)) for count in counts]
     why = ladder.climb(halved[:2])
     beginnings: list[Finer] = [_with_smooth_stiffness]
     if ladder.best is not even:
@@ -138,7 +153,7 @@ class _Ladder:
     def _spent(self) -> int:
         return sum(len(tried.evaluations) for tried in self._tried)
 
-    def climb(self, rungs: Iterable[tuple[int | None, Finer]], shown: bool = False) -> str:
+    def climb(self, rungs: Iterable[Rung], shown: bool = False) -> str:
         """
         Try rungs, each from the previous one, until two of them predict no better than the best.
 
@@ -146,29 +161,27 @@ class _Ladder:
         rung that is kept must predict significantly better.  Until then, one that predicts better in the mean
         alone is not kept, but is no failure; after it, that is enough.
 
-        :param rungs: the number of knots or parts of each, and how to refine a space; None for bends at
-            clamps: where these are not kept, the next rung is refined from the one before them.
         :param shown: whether a rung before these was kept.
         :returns: why it ended, in words; empty if there is no finer rung.
         """
         why, latest, missed = '', self.best, 0
-        for count, finer in rungs:
+        for rung in rungs:
             if self.best.explained(self._level):
                 break
-            space, _ = finer(latest.space, latest.best.point)
+            space, _ = rung.finer(latest.space, latest.best.point)
             if space == latest.space:
                 continue
             if self._budget - self._spent < 2 * space.dimension:
                 self.over = True
-                return f': the rest of the budget is too small to try {count or "bends"}'
+                return f': the rest of the budget is too small to try {rung.name}'
             try:
-                stage = self._fitted(latest, finer)
+                stage = self._fitted(latest, rung.finer)
                 errors = None if stage is None else self._fold_errors(stage)
             except CancelledError:
                 self.over = True
-                return f': stopped before {count or "bends"} were fitted'
+                return f': stopped before {rung.name} were fitted'
             except SimulationError:  # the fit of the coarser space remains valid
-                return f': {count or "bends"} could not be simulated'
+                return f': {rung.name} could not be simulated'
             gain = 0.0
             if stage is not None and errors is not None:
                 if self._best_errors is None:
@@ -178,18 +191,18 @@ class _Ladder:
                     self.best, self._best_errors, why, shown = stage, errors, '', True
                     latest = stage
                     continue
-            if count is None:
+            if rung.aside:
                 continue
             latest = stage or latest
-            why = f': {count} would explain too little' if stage is None else \
-                f': {count} would not predict left-out trials better'
+            why = f': {rung.name} would explain too little' if stage is None else \
+                f': {rung.name} would not predict left-out trials better'
             missed += gain <= LEAST_GAIN
             if missed == 2:
                 break
         return why
 
-    def instead(self, coarse: Fit, finers: Sequence[Finer], rungs: Sequence[tuple[int | None, Finer]],
-                name: str, does: str) -> str:
+    def instead(self, coarse: Fit, finers: Sequence[Finer], rungs: Sequence[Rung], name: str,
+                does: str) -> str:
         """
         Climb a second time, from another beginning; keep where it leads if that predicts better.
 

@@ -125,6 +125,9 @@ class Pool:
             except TimeoutError:
                 if future.done():
                     return future.result()
+            except KeyboardInterrupt:
+                self.stop()
+                raise
         self.stop()
         raise CancelledError
 

@@ -50,7 +50,7 @@ class TrackedLine:
     :param line: (n, 2) [px], evenly along the DLO.
     :param seen: (n,).
     :param ends: whether both ends are seen.
-    :param excess: share of the length by which the line between two visible ends is too long.
+    :param excess: share of the length by which the DLO looks too long, as far as that is known.
     :param lift: which part a hand seems to lift.
     """
 
@@ -101,19 +101,26 @@ def elastic_line(image: DloImage, before: TrackedLine, shown: Shown) -> TrackedL
             return fit.between_ends(line, excess, lift)
         # What covers an end makes the DLO look shorter, and so does an end that is held in the air; both
         # move.
-        moved = np.linalg.norm(fit.places - before.line[[0, -1]], axis=1)
-        accepted[int(np.argmax(lift.strange if lift.held else moved))] = False
+        tells = np.linalg.norm(fit.places - before.line[[0, -1]], axis=1)
+        if lift.held:
+            # An end so high that the DLO looks longer has moved far, whatever is behind it.
+            tells = lift.ends if excess > fit.tolerance else lift.strange
+        accepted[int(np.argmax(tells))] = False
     ends = (bool(accepted[0]), bool(accepted[1]))
     found = replace(before, line=fit.through(accepted), ends=ends, excess=0.0, lift=lift)
     held = int(np.argmin(accepted))
-    if not any(accepted) or not lift.held or shown.ends[held] is None:
+    if not any(accepted) or not lift.held:
         return found
-    # The DLO does not end before the hand that holds its end.
-    whole = fit.through(np.full(2, True), LOOSE)
-    excess = fit.excess(whole)
+    # The DLO does not end before the hand that holds its end.  Where that end is not seen, it looks as long
+    # as before.
+    whole, excess = found.line, before.excess
+    if shown.ends[held] is not None:
+        whole = fit.through(np.full(2, True), LOOSE)
+        excess = fit.excess(whole)
     if not fit.tolerance < excess < LONGEST:
         return found
-    return replace(found, line=fit.lifted(whole, excess, replace(lift, centre=held * (len(whole) - 1.0))))
+    lifted = fit.lifted(whole, excess, replace(lift, centre=held * (len(whole) - 1.0)))
+    return replace(found, line=lifted, excess=excess)
 
 
 class _Fit:

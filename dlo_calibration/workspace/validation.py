@@ -19,6 +19,7 @@ from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.result import CalibrationResult, simulated_chains
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.evaluation.evaluation import Evaluator
+from dlo_calibration.evaluation.pool import Pool, Threads
 from dlo_calibration.files.result import Description
 from dlo_calibration.inference.outlier import SOMETHING_ELSE, SURELY
 from dlo_calibration.model.parameters import BY_NAME, measured, number, ParameterSpace
@@ -26,7 +27,7 @@ from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.grips import GripEvidence
 from dlo_calibration.observation.material import with_shared_places
 from dlo_calibration.observation.plausibility import implausible_trials
-from dlo_calibration.simulation.protocol import Rollout, simulate_all, Stop
+from dlo_calibration.simulation.protocol import Rollout
 
 # Unseen actions of the reference objects have up to 1.7 times the error of the calibration (intervals.md in
 # benchmark/results); a DLO of which points move by less than 0.5 % of the length behaves the same.
@@ -46,9 +47,11 @@ def validated(file: Description, trials: Sequence[Trial], options: Options,
     evidence = GripEvidence.of(trials)
     trials = with_shared_places(evidence.require_usable(trials))
     space, hands = _with_errors(evidence, file)
-    with closing(make_simulator(options)) as simulator:
+    point = space.point(file.values)
+    with closing(make_simulator(options)) as simulator, closing(Threads(options.workers)) as threads:
         begun = time.monotonic()
-        evaluation = Evaluator(trials, space, simulator).evaluate(0, space.point(file.values))
+        evaluator = Evaluator(trials, space, simulator)
+        evaluation = evaluator.evaluated(0, point, Pool(simulator, threads).simulate(evaluator.jobs(point)))
         seconds = time.monotonic() - begun
     if evaluation.failure:
         raise SimulationError(evaluation.failure)
@@ -122,11 +125,11 @@ def _spreads(result: CalibrationResult, file: Description, options: Options, cho
     from dlo_calibration.planning.dlo import Posterior  # loads slowly, and is rarely needed
 
     drawn = Posterior.of(file).drawn_values(DRAWS, 1)
-    with closing(make_simulator(options)) as simulator:
+    with closing(make_simulator(options)) as simulator, closing(Threads(options.workers)) as threads:
         evaluator = Evaluator(result.trials, result.space, simulator)
         every = [evaluator.jobs(result.space.point(dict(zip(file.space.free, values, strict=True))))
                  for values in drawn]
-        rollouts = simulate_all(simulator, [jobs[k] for k in chosen for jobs in every], Stop())
+        rollouts = Pool(simulator, threads).simulate([jobs[k] for k in chosen for jobs in every])
     spreads = []
     for n, k in enumerate(chosen):
         chains = [rollout.chains for rollout in rollouts[n * DRAWS:(n + 1) * DRAWS]

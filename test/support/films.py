@@ -85,9 +85,9 @@ class Renderer:
                                np.sin(elevation)])
         self._noise = self._generator.standard_normal((1200, 2100, 3), dtype=np.float32) * look.noise
 
-    def restart(self):
+    def restart(self, seed=0):
         """Begin a film whose noise does not depend on the films before."""
-        self._generator = np.random.default_rng(0)
+        self._generator = np.random.default_rng(seed)
 
     def image(self, instants):
         """Return an image (h, w, 3) uint8, exposed at one or more instants."""

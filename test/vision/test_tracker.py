@@ -51,12 +51,12 @@ def scale_of(camera):
     return Scale(lens, camera.rotation, -camera.rotation @ camera.position, np.zeros(1), True)
 
 
-def tracked(curves, hands=None, camera=CAMERA, drawn=None, scaled=True):
+def tracked(curves, hands=None, camera=CAMERA, drawn=None, scaled=True, seed=0):
     """Return what is tracked in the images of curves."""
     tracker, listed = Tracker(COUNT), []
     scale = scale_of(camera) if scaled else None
     drawn = drawn or (lambda pixels, k: pixels)
-    renderer().restart()
+    renderer().restart(seed)
     for k, curve in enumerate(curves):
         pixels = drawn(renderer().image([Instant(camera, curve, hands[k] if hands else ())]), k)
         if k == 0:
@@ -373,13 +373,14 @@ def held_up(height):
 
 
 @pytest.mark.long
-def test_a_line_reaches_the_hand_that_holds_its_end_high_above_the_table():
-    heights = np.concatenate([np.zeros(3), np.linspace(0.0, 0.25, 25), np.full(3, 0.25)])
+@pytest.mark.parametrize('seed', [0, 1, 7])  # in the noise of the last ones, the hand can hardly be told
+def test_a_line_reaches_the_hand_that_holds_its_end_high_above_the_table(seed):
+    heights = np.concatenate([np.zeros(3), np.linspace(0.0, 0.25, 25), np.full(6, 0.25)])
     curves = [held_up(height) for height in heights]
     hands = [(Hand((curve[0, 0] - 0.01, 0.0), math.pi, curve[0, 2]),) if k else ()
              for k, curve in enumerate(curves)]
     aslant = Camera(CAMERA.size, 620.0, 0.9, 0.1, 0.0, 1.0, (0.25, 0.05))
-    found = tracked(curves, hands, aslant)
+    found = tracked(curves, hands, aslant, seed=seed)
     seen = aslant.project(curves[-1])
     for one, curve in zip(found, curves, strict=True):
         assert not one.lost
