@@ -12,7 +12,7 @@ import pytest
 
 from dlo_calibration.calibration.calibrate import fitted
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.calibration.refinement import _Ladder
+from dlo_calibration.calibration.refinement import _Ladder, Rung
 from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.evaluation.evaluation import Evaluator
 from dlo_calibration.model.chain import Chain
@@ -184,7 +184,7 @@ def climbed(monkeypatch, *logarithms):
     coming = iter(rungs[1:])
     monkeypatch.setattr(ladder, '_fitted', lambda *arguments: next(coming))
     monkeypatch.setattr(ladder, '_fold_errors', lambda rung: rung.errors)
-    ladder.climb([(count, lambda space, point, count=count: (replace(space, mass=count), point))
+    ladder.climb([Rung(str(count), lambda space, point, count=count: (replace(space, mass=count), point))
                   for count in (3, 5, 9)])
     return [rung is ladder.best for rung in rungs].index(True)
 
