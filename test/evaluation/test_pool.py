@@ -3,10 +3,10 @@
 
 """A pool: the same rollouts in the same order for any number of threads, and a wait that can be stopped."""
 
-import _thread
 from concurrent.futures import CancelledError
 from contextlib import closing
 import os
+import signal
 import sys
 import threading
 import time
@@ -61,14 +61,18 @@ def test_a_stop_ends_what_is_under_way_and_what_waits(workers):
 
 def test_ctrl_c_ends_what_is_under_way():
     engine = Stoppable()
-    with closing(Threads(2)) as threads:
-        begun = Pool(engine, threads).begin(JOBS)
-        assert engine.begun.wait(60)
-        threading.Timer(0.1, _thread.interrupt_main).start()
-        with pytest.raises(KeyboardInterrupt):
-            begun()
-        with pytest.raises(CancelledError):
-            begun()
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # pytest-xdist ignores it
+    try:
+        with closing(Threads(2)) as threads:
+            begun = Pool(engine, threads).begin(JOBS)
+            assert engine.begun.wait(60)
+            threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start()
+            with pytest.raises(KeyboardInterrupt):
+                begun()
+            with pytest.raises(CancelledError):
+                begun()
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_rollouts_in_memory_are_not_simulated_again(tmp_path):
