@@ -87,8 +87,8 @@ setup(
         'numpy>=1.26',
         'opencv-python-headless>=4.6',
         'pillow>=9.4',
-        'PyYAML>=6.0',
         'pybullet>=3.2.5; python_version < "3.12"',  # for later ones PyPI has no binary
+        'PyYAML>=6.0',
         'rich>=13.7',
         'rosbags>=0.11',
         'scipy>=1.11',

@@ -67,7 +67,8 @@ class Rung:
 
     :param name: of what is tried, in words.
     :param finer: how it refines a space.
-    :param aside: whether the next rung begins below it where it is not kept, which then is no failure.
+    :param aside: whether it is no failure if this rung is not kept; then the next one begins at the rung
+        before.
     """
 
     name: str

@@ -101,10 +101,10 @@ def elastic_line(image: DloImage, before: TrackedLine, shown: Shown) -> TrackedL
             return fit.between_ends(line, excess, lift)
         # What covers an end makes the DLO look shorter, and so does an end that is held in the air; both
         # move.  An end so high that the DLO looks longer has moved far, whatever is behind it.
-        if not lift.held:
-            signs = np.linalg.norm(fit.places - before.line[[0, -1]], axis=1)
-        else:
+        if lift.held:
             signs = lift.ends if excess > fit.tolerance else lift.strange
+        else:
+            signs = np.linalg.norm(fit.places - before.line[[0, -1]], axis=1)
         accepted[int(np.argmax(signs))] = False
     ends = (bool(accepted[0]), bool(accepted[1]))
     found = replace(before, line=fit.through(accepted), ends=ends, excess=0.0, lift=lift)
