@@ -132,7 +132,8 @@ def _reaches(clicks: Floats, scale: float) -> Floats:
 
 def _no_dlo() -> InputError:
     return InputError('clicks', 'nothing along them that looks the same from end to end', 'clicks on a DLO',
-                      'click on both ends of the DLO, and on its bends, in order')
+                      'click on both ends of the DLO, and on its bends, in order; if its colour is that of '
+                      'the ground, photograph it on another one')
 
 
 def _crossings(line: Floats, strength: Floats, width: float) -> list[Crossing]:
