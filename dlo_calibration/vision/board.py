@@ -25,6 +25,7 @@ import numpy as np
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.vision.photograph import Pixels
+from dlo_calibration.vision.sheet import Sheet
 from dlo_calibration.vision.tags import QUIET, TAG_CELLS, tag_cells, TAG_SIDE, TAGS
 from dlo_calibration.writing import write_file
 
@@ -34,6 +35,7 @@ INSET = (SQUARE - MARKER) / 2.0  # m, of a marker in its square
 RULER = 0.1  # m, length of the printed line that shows whether the printer changed the size
 CELLS = 6  # of a marker's side: 4 bits and a border
 MARKERS = COLUMNS * ROWS // 2  # one in each white square
+EDGE = 0.002  # m beside the edge of a square, where a picture may show either colour
 FEWEST_CORNERS = 8  # of 48: a third of the sheet, which still determines how it lies
 FEWEST_MARKERS = 3
 ENOUGH_CORNERS = 36  # that make the search in full resolution needless
@@ -67,9 +69,11 @@ PAPERS: Mapping[str, Paper] = {'a4': Paper('A4', 0.210, 0.297, 0),
                                'letter': Paper('Letter', 0.2159, 0.2794, MARKERS)}
 
 
-def sheet_outline(printed: float = RULER) -> Floats:
+def printed_sheet(printed: float = RULER) -> Sheet:
     """
-    Return the corners (4, 2) of the paper around the board, in the board's frame [m].
+    Return the sheet in the board's frame: its parts are white around the squares, and the black squares.
+
+    The squares with markers have both colours, and so has what is beside the edge of a square.
 
     :param printed: length of the board's ruler line, as measured on the print [m].
     """
@@ -77,8 +81,19 @@ def sheet_outline(printed: float = RULER) -> Floats:
     half_width = max(paper.width for paper in PAPERS.values()) / 2.0
     height = max(paper.height for paper in PAPERS.values())
     middle = COLUMNS * SQUARE / 2.0
-    corners = np.array([(-half_width, 0.0), (half_width, 0.0), (half_width, height), (-half_width, height)])
-    return (corners + (middle, -BOTTOM)) * (printed / RULER)
+    left, lower, right, upper = middle - half_width, -BOTTOM, middle + half_width, height - BOTTOM
+    first, last, top = -EDGE, COLUMNS * SQUARE + EDGE, ROWS * SQUARE + EDGE
+    white = [_rectangle(left, lower, right, first), _rectangle(left, top, right, upper),
+             _rectangle(left, lower, first, upper), _rectangle(last, lower, right, upper)]
+    black = [_rectangle(column * SQUARE + EDGE, row * SQUARE + EDGE, (column + 1) * SQUARE - EDGE,
+                        (row + 1) * SQUARE - EDGE)
+             for column, row in itertools.product(range(COLUMNS), range(ROWS)) if (column + row) % 2 == 0]
+    return Sheet(tuple(np.array(part) * (printed / RULER) for part in (
+        [_rectangle(left, lower, right, upper)], white, black)))
+
+
+def _rectangle(left: float, bottom: float, right: float, top: float) -> Floats:
+    return np.array([(left, bottom), (right, bottom), (right, top), (left, top)])
 
 
 def marker_squares() -> list[tuple[int, int]]:

@@ -24,11 +24,13 @@ class DloImage:
     :param pixels: (h, w, 3) RGB.
     :param scale: None: lengths are those in the picture.
     :param dlo: what it looks like.
+    :param covered: (h, w) where something of its colour would hide it; None: nowhere.
     """
 
     pixels: Pixels
     scale: Scale | None
     dlo: Appearance
+    covered: Bools | None = None
 
     def finenesses(self, line: Floats) -> Floats:
         """Return the pixels (n - 1,) to a unit of the length, of each segment of a line (n, 2)."""
@@ -48,7 +50,10 @@ class DloImage:
         return arc_lengths(line if self.scale is None else self.scale.points(line))
 
     def inside(self, points: Floats, margin: float) -> Bools:
-        """Tell which points (n, 2) [px] are farther than a margin within the picture."""
-        height, width = self.pixels.shape[:2]
-        most = (width - 1 - margin, height - 1 - margin)
-        return np.asarray(((points > margin) & (points < most)).all(axis=1))
+        """Tell which points (n, 2) [px] are farther than a margin within the picture, and not covered."""
+        most = np.array(self.pixels.shape[1::-1]) - 1
+        found = np.asarray(((points > margin) & (points < most - margin)).all(axis=1))
+        if self.covered is not None:
+            u, v = np.clip(np.rint(np.where(found[:, None], points, 0.0)), 0, most).astype(int).T
+            found &= ~self.covered[v, u]
+        return found

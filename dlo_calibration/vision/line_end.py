@@ -28,6 +28,7 @@ from dlo_calibration.vision.ridge import Singles
 LAST = 30  # stations, within which the last part of the DLO is seen
 SURE = 0.3  # how sure it is of a place of that part, at least
 BEYOND = 6.0  # half widths behind the last part that looks like the DLO, from which on its end is looked for
+CLEAR = 1.5  # half widths behind that part, which the picture must show
 LONGEST_TIP = 14  # half widths by which the line may be too short
 FAN = np.radians(np.arange(-50.0, 51.0, 10.0))  # directions in which the DLO may go on
 REACHES = np.array([0.4, 0.8, 1.2, 1.6])  # half widths, where colours are read in each of them
@@ -61,16 +62,18 @@ def end_of(image: DloImage, half: float, measured: Floats, quality: Floats,
     near = np.flatnonzero(quality[:LAST] > SURE)
     if len(near) < 4:
         return None
-    first = near[0]
-    part = measured[first:first + 8]
-    towards = part[0] - part[-1]
+    part = measured[near[0]:]
+    part = part[:np.append(np.flatnonzero(~image.inside(part, 0.0)), len(part))[0]]
+    if len(part) < 2:
+        return None
+    towards = part[0] - part[:8][-1]
     towards = towards / max(float(np.linalg.norm(towards)), 1e-9)
     tip, towards = _tip(image, part[0], towards, half)
     way = evenly(np.concatenate([tip[-1:] + BEYOND * half * towards, tip[::-1],
-                                 measured[first:first + 14]]), 0.2 * half)
+                                 part[:14]]), 0.2 * half)
     arc = arc_lengths(way)
     inside = image.inside(way, 0.0)
-    if not inside[arc > (BEYOND - 3) * half].all():
+    if not inside[arc > (BEYOND - CLEAR) * half].all():
         return None
     halves = np.full(len(way), half)
     strip = straighten(image.pixels, way, halves, np.linspace(-0.25, 0.25, 5))
@@ -83,7 +86,7 @@ def end_of(image: DloImage, half: float, measured: Floats, quality: Floats,
     # The ground beside the last part, and what is behind the end.
     beside = straighten(image.pixels, way, halves, SIDES).lab
     last = (arc > end + 0.5 * half) & (arc < end + 5 * half)
-    behind = strip.lab[(arc < end - 0.8 * half) & (arc > end - 3.0 * half)].reshape(-1, 3)
+    behind = strip.lab[inside & (arc < end - 0.8 * half) & (arc > end - 3.0 * half)].reshape(-1, 3)
     if not len(behind) or not last.any():
         return None
     sides = [beside[last][:, part].reshape(-1, 3).mean(axis=0) for part in (slice(0, 3), slice(3, 6))]

@@ -18,6 +18,7 @@ from dlo_calibration.model.chain import Floats
 from dlo_calibration.vision.axis import measured_diameter
 from dlo_calibration.vision.photograph import jpeg, MAXIMUM_PIXELS, Photograph, Pixels
 from dlo_calibration.vision.scale import Scale
+from dlo_calibration.vision.sheet import NO_SHEET
 from dlo_calibration.vision.tags import tag_poses, TagFinder, TagPose
 from dlo_calibration.vision.tracer import LINE, OUTLINE, Trace
 from dlo_calibration.vision.tracker import COUNT, Tracked, Tracker
@@ -100,7 +101,7 @@ class Observer:
     """
 
     def __init__(self, scale: Scale | BoardFinder | None, count: int = COUNT) -> None:
-        sheet = scale.sheet if isinstance(scale, BoardFinder) else None
+        sheet = scale.sheet if isinstance(scale, BoardFinder) else NO_SHEET
         self._given, self._tracker, self._finder = scale, Tracker(count, sheet), TagFinder()
         self._time = 0.0
 

@@ -14,13 +14,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter1d
 
 from dlo_calibration.model.chain import Floats, frozen_array
-from dlo_calibration.vision.appearance import Appearance
+from dlo_calibration.vision.appearance import Appearance, Bools
 from dlo_calibration.vision.dlo_image import DloImage
 from dlo_calibration.vision.elastic_line import TrackedLine
 from dlo_calibration.vision.followed_line import FAR, followed
@@ -37,6 +36,7 @@ from dlo_calibration.vision.line_search import (
 from dlo_calibration.vision.middle_line import along_line, arc_lengths, evenly
 from dlo_calibration.vision.photograph import Pixels
 from dlo_calibration.vision.scale import Scale
+from dlo_calibration.vision.sheet import COVER, NO_SHEET, Sheet
 from dlo_calibration.vision.tracer import Tracer
 
 COUNT = 61  # points along the DLO
@@ -49,8 +49,7 @@ LEAST_PART = 3.0  # widths long: what is shorter may be a finger
 SHOWN = 0.2  # share of the DLO's area that has its colour in the first image, at least
 ADAPTED = 0.05  # share by which what is usual follows each image
 DAMPED = 0.7  # of the velocity that remains
-SHEET_ALIKE = 0.1  # share of the sheet that has the DLO's colour, from which on it hides the DLO
-COVER = (255, 0, 255)  # red, green, blue of such a sheet in the image that is searched
+SHEET_ALIKE = 0.1  # share of a part of the sheet that has the DLO's colour, from which on it hides the DLO
 SEARCHES = 10  # images from one search of the whole picture to the next
 ELSEWHERE = 'the DLO is also where the line is not: move it slowly, or start again with new clicks'
 NO_END = "neither end is seen, and the sheet has the DLO's colour: lay it where the DLO does not come"
@@ -87,12 +86,11 @@ class Tracker:
     Follows a DLO from image to image, forwards or backwards in time.
 
     :param count: of points along the DLO.
-    :param sheet: corners (k, 2) on the table [m] of a sheet of paper, which may have the DLO's colour; None:
-        there is none, or no scale.
+    :param sheet: on the table, of which parts may have the DLO's colour.
     """
 
-    def __init__(self, count: int = COUNT, sheet: Floats | None = None) -> None:
-        self._count, self._sheet, self._hides = count, sheet, False
+    def __init__(self, count: int = COUNT, sheet: Sheet = NO_SHEET) -> None:
+        self._count, self._sheet, self._hide = count, sheet, np.zeros(len(sheet.parts) + 1, bool)
 
     def start(self, pixels: Pixels, clicks: ArrayLike, scale: Scale | None = None) -> Tracked:
         """
@@ -114,7 +112,7 @@ class Tracker:
         self._velocity: Floats = np.zeros_like(line)
         self._lost_for = 0
         self._shown = 1.0
-        self._hides = self._like_sheet(DloImage(pixels, scale, self._dlo))
+        self._hide = self._alike(DloImage(pixels, scale, self._dlo))
         image = self._image(pixels)
         _, free, own = elsewhere(image, line, self._shown)
         # Where it is thin or blurred, less than its area has its colour.
@@ -167,28 +165,26 @@ class Tracker:
             self._scale = scale
 
     def _image(self, pixels: Pixels) -> DloImage:
-        """Return an image in which a sheet of the DLO's colour is covered by a colour that nothing has."""
-        outline = self._outline() if self._hides else None
-        if outline is not None:
-            pixels = np.asarray(cv2.fillPoly(pixels.copy(), [outline], COVER), np.uint8)
-        return DloImage(pixels, self._scale, self._dlo)
+        """Return an image in which the sheet's parts of the DLO's colour have one that nothing has."""
+        if self._scale is None or not self._hide.any():
+            return DloImage(pixels, self._scale, self._dlo)
+        covered = self._hide[self._sheet.shown(self._scale, pixels.shape[:2])]
+        pixels = pixels.copy()
+        pixels[covered] = COVER
+        return DloImage(pixels, self._scale, self._dlo, covered)
 
-    def _outline(self) -> NDArray[np.int32] | None:
-        """Return the corners (k, 2) of the sheet [px]; None: it is unknown where it is."""
-        if self._sheet is None or self._scale is None:
-            return None
-        corners = self._scale.to_pixels(np.column_stack([self._sheet, np.zeros(len(self._sheet))]))
-        return np.rint(corners).astype(np.int32) if np.isfinite(corners).all() else None
-
-    def _like_sheet(self, image: DloImage) -> bool:
-        """Tell whether so much of the sheet has the DLO's colour that it hides the DLO."""
-        outline = self._outline()
-        if outline is None:
-            return False
-        width = image.width(self._line.line)
-        mask = coloured(image, width)
-        paper = cv2.fillPoly(np.zeros(mask.shape, np.uint8), [outline // reduction(width)], 1) > 0
-        return bool(paper.any() and mask[paper].mean() > SHEET_ALIKE)
+    def _alike(self, image: DloImage) -> Bools:
+        """Tell of each part of the sheet, after what is beside it, whether it hides a DLO of its colour."""
+        found = np.zeros(len(self._sheet.parts) + 1, bool)
+        if self._scale is not None:
+            width = image.width(self._line.line)
+            step, mask = reduction(width), coloured(image, width)
+            shown = self._sheet.shown(self._scale, image.pixels.shape[:2])[::step, ::step]
+            for number in range(2, len(found)):
+                part = shown == number
+                found[number] = part.any() and mask[part].mean() > SHEET_ALIKE
+            found[1:2] = found.any()
+        return found
 
     def _tracked(self, image: DloImage) -> Tracked:
         place = np.linspace(0, len(self._line.line) - 1, self._count)
@@ -206,10 +202,10 @@ class Tracker:
         if not np.isfinite(found.line).all():
             return 'the line could not be fitted: start again with new clicks'
         if image.inside(found.line, 0.0).mean() < LEAST:
-            return 'the DLO has left the picture: show it again'
+            return 'the DLO has left the picture, or lies on a sheet of its colour: show it again'
         if found.seen.mean() < LEAST:
             return 'too little of the DLO is seen: take hands out of the way, and move it slowly'
-        if self._hides and not any(found.ends):
+        if self._hide.any() and not any(found.ends):
             return NO_END
         unexplained = elsewhere(image, found.line, self._shown)[1] / self._area(image, found.line)
         least = LEAST_PART * image.width(found.line) / float(arc_lengths(found.line)[-1])

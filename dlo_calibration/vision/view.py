@@ -24,9 +24,9 @@ from dlo_calibration.vision.board import (
     COLUMNS,
     FEWEST_CORNERS,
     find_board,
+    printed_sheet,
     ROWS,
     RULER,
-    sheet_outline,
     SQUARE,
 )
 from dlo_calibration.vision.film import Film
@@ -34,6 +34,7 @@ from dlo_calibration.vision.lens import Lens
 from dlo_calibration.vision.photograph import Pixels
 from dlo_calibration.vision.pose import scale_from_points
 from dlo_calibration.vision.scale import Scale
+from dlo_calibration.vision.sheet import Sheet
 
 Bools = NDArray[np.bool_]
 
@@ -74,9 +75,9 @@ class BoardFinder:
         self._moves = False
 
     @property
-    def sheet(self) -> Floats:
-        """The corners (4, 2) of the paper around the board, on the table [m]."""
-        return sheet_outline(self._printed)
+    def sheet(self) -> Sheet:
+        """The sheet that the board is printed on."""
+        return printed_sheet(self._printed)
 
     def next(self, pixels: Pixels) -> Scale | None:
         """

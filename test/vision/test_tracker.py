@@ -14,6 +14,7 @@ import numpy as np
 from photographs import Camera, Hand
 import pytest
 
+from dlo_calibration.vision.board import BOTTOM, COLUMNS, PAPERS, SQUARE
 from dlo_calibration.vision.lens import Lens
 from dlo_calibration.vision.observer import Observer
 from dlo_calibration.vision.scale import Scale
@@ -25,6 +26,7 @@ COUNT = 21
 CAMERA = Camera((640, 480), 620.0, 0.3, 0.1, 0.0, 0.8, (0.25, 0.0))
 STEP = 1 / 30  # s
 FAR = 0.004  # m: half a diameter is 5 mm
+BESIDE = LaidBoard((0.3, -0.45), 0.1)
 
 
 @functools.cache
@@ -311,10 +313,9 @@ def test_a_thin_loop_that_jumps_is_lost_until_all_of_it_is_found(radius, shift, 
     assert found[-1].lost != found_again
 
 
-def beside_a_sheet(curves, hands):
+def beside_a_sheet(curves, hands, board=BESIDE):
     """Yield what is seen of a white DLO on a table with a white sheet, and the errors (COUNT,) [m]."""
     look = plain_look(colour=(0.92, 0.92, 0.9), ground='cloth', ground_colour=(0.22, 0.25, 0.3))
-    board = LaidBoard((0.3, -0.45), 0.1)
     white = Renderer(replace(look, sheets=(board.sheet,)), RADIUS, (-0.3, -0.5), (0.8, 0.5))
     camera = Camera((1280, 960), 1240.0, 0.3, 0.1, 0.0, 1.0, (0.27, -0.08))
     observer = Observer(BoardFinder(Lens(camera.size, camera.matrix, np.zeros(4))), COUNT)
@@ -335,13 +336,31 @@ def test_a_white_dlo_is_told_from_the_white_sheet_that_a_hand_partly_hides():
 
 
 @pytest.mark.long
-def test_a_white_dlo_is_not_seen_over_a_white_sheet():
+def test_a_white_dlo_over_a_white_sheet_is_seen_at_black_squares_alone():
     curves = [bent(0.4, (0.0, 0.05 - 0.02 * k)) for k in range(14)]
     *_, (found, off) = beside_a_sheet(curves, [()] * len(curves))
     assert not found.tracked.lost, found.tracked.reason
     assert np.isfinite(off[1:12]).all()
-    assert np.isnan(off[15:]).all()  # over the sheet
     assert np.nanmax(off) < FAR
+    over = BESIDE.seen_from(points_of(curves[-1]))[15:, :2][np.isfinite(off[15:])]
+    assert len(over)
+    assert (np.floor(over / SQUARE).sum(axis=1) % 2 == 0).all()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(('column', 'seen'), [(2, True), (3, False)])
+def test_the_end_of_a_white_dlo_is_seen_on_a_black_square(column, seen):
+    curves = [bent(0.4, (0.0, 0.12 - 0.02 * k)) for k in range(14)]
+    place = [(column + 0.5) * SQUARE + (PAPERS['a4'].width - COLUMNS * SQUARE) / 2, 4.5 * SQUARE + BOTTOM]
+    board = LaidBoard(tuple(curves[-1][-1, :2] - place))
+    last = curves[-1:] * 4
+    hand = (Hand(tuple(curves[-1][0, :2])),)
+    *_, (found, off) = beside_a_sheet(curves + last, [()] * len(curves) + [hand] * len(last), board)
+    assert found.tracked.lost == (not seen)
+    if seen:
+        assert np.nanmax(off) < FAR
+    else:
+        assert 'neither end is seen' in found.tracked.reason
 
 
 def taped(pixels, curve, camera=CAMERA):
