@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Iterable
 
 import cv2
 import numpy as np
@@ -28,20 +29,21 @@ class Sheet:
 
     parts: tuple[Floats, ...]
 
-    def shown(self, scale: Scale, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    def drawn(self, scale: Scale, shape: tuple[int, ...], values: Iterable[int]) -> NDArray[np.uint8]:
         """
-        Return (h, w): which part a picture shows, counted from 1; 0 where it shows none, or none is known.
+        Return (h, w): the value of the part that a picture shows; 0 where it shows none, or none is known.
 
         :param shape: height and width of the picture [px].
+        :param values: one of each part, 0 to 255.
         """
         found = np.zeros(shape, np.uint8)
-        for number, part in enumerate(self.parts, 1):
+        for part, value in zip(self.parts, values, strict=True):
             corners = part.reshape(-1, 2)
             places = scale.to_pixels(np.column_stack([corners, np.zeros(len(corners))]))
             if not np.isfinite(places).all():
                 return np.zeros(shape, np.uint8)
             for polygon in np.rint(places).astype(np.int32).reshape(part.shape):
-                cv2.fillConvexPoly(found, polygon, number)
+                cv2.fillConvexPoly(found, polygon, int(value))
         return found
 
 

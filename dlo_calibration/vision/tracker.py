@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter1d
@@ -90,7 +91,7 @@ class Tracker:
     """
 
     def __init__(self, count: int = COUNT, sheet: Sheet = NO_SHEET) -> None:
-        self._count, self._sheet, self._hide = count, sheet, np.zeros(len(sheet.parts) + 1, bool)
+        self._count, self._sheet, self._hide = count, sheet, np.zeros(len(sheet.parts), bool)
 
     def start(self, pixels: Pixels, clicks: ArrayLike, scale: Scale | None = None) -> Tracked:
         """
@@ -168,22 +169,25 @@ class Tracker:
         """Return an image in which the sheet's parts of the DLO's colour have one that nothing has."""
         if self._scale is None or not self._hide.any():
             return DloImage(pixels, self._scale, self._dlo)
-        covered = self._hide[self._sheet.shown(self._scale, pixels.shape[:2])]
+        covered = self._sheet.drawn(self._scale, pixels.shape[:2], self._hide)
+        u, v, width, height = cv2.boundingRect(covered)
+        part = np.s_[v:v + height, u:u + width]
         pixels = pixels.copy()
-        pixels[covered] = COVER
-        return DloImage(pixels, self._scale, self._dlo, covered)
+        pixels[part][covered[part] > 0] = COVER
+        return DloImage(pixels, self._scale, self._dlo, covered > 0)
 
     def _alike(self, image: DloImage) -> Bools:
-        """Tell of each part of the sheet, after what is beside it, whether it hides a DLO of its colour."""
-        found = np.zeros(len(self._sheet.parts) + 1, bool)
+        """Tell of each part of the sheet whether it hides the DLO, whose colour it has."""
+        found = np.zeros(len(self._sheet.parts), bool)
         if self._scale is not None:
             width = image.width(self._line.line)
             step, mask = reduction(width), coloured(image, width)
-            shown = self._sheet.shown(self._scale, image.pixels.shape[:2])[::step, ::step]
-            for number in range(2, len(found)):
+            numbers = range(1, len(found) + 1)
+            shown = self._sheet.drawn(self._scale, image.pixels.shape[:2], numbers)[::step, ::step]
+            for number in numbers[1:]:
                 part = shown == number
-                found[number] = part.any() and mask[part].mean() > SHEET_ALIKE
-            found[1:2] = found.any()
+                found[number - 1] = part.any() and mask[part].mean() > SHEET_ALIKE
+            found[:1] = found.any()
         return found
 
     def _tracked(self, image: DloImage) -> Tracked:
