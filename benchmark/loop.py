@@ -109,7 +109,7 @@ def through(points: Floats) -> Trace:
 
 
 def clicks(truth: Floats, count: int, off: float, seed: int) -> Floats:
-    """Return places (count, 2) along an annotation; all but the first and the last one are off [px]."""
+    """Return places (count, 2) along an annotation; all but both outer ones lie beside it by `off` [px]."""
     angles = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, count)
     moved = off * np.column_stack([np.cos(angles), np.sin(angles)])
     moved[[0, -1]] = 0.0

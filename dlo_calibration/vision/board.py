@@ -71,9 +71,9 @@ PAPERS: Mapping[str, Paper] = {'a4': Paper('A4', 0.210, 0.297, 0),
 
 def printed_sheet(printed: float = RULER) -> Sheet:
     """
-    Return the sheet in the board's frame: its parts are white around the squares, and the black squares.
+    Return the sheet in the board's frame: all of it, the white around the squares, and the black squares.
 
-    The squares with markers have both colours, and so has what is beside the edge of a square.
+    Of the first part, the squares with markers and what is beside the edges of squares are left.
 
     :param printed: length of the board's ruler line, as measured on the print [m].
     """

@@ -63,6 +63,7 @@ def end_of(image: DloImage, half: float, measured: Floats, quality: Floats,
     if len(near) < 4:
         return None
     part = measured[near[0]:]
+    # What is measured where the DLO is covered tells nothing of its direction.
     part = part[:np.append(np.flatnonzero(~image.inside(part, 0.0)), len(part))[0]]
     if len(part) < 2:
         return None

@@ -166,7 +166,7 @@ class Tracker:
             self._scale = scale
 
     def _image(self, pixels: Pixels) -> DloImage:
-        """Return an image in which the sheet's parts of the DLO's colour have one that nothing has."""
+        """Return an image in which the parts of the sheet that hide the DLO are covered."""
         if self._scale is None or not self._hide.any():
             return DloImage(pixels, self._scale, self._dlo)
         covered = self._sheet.drawn(self._scale, pixels.shape[:2], self._hide)
@@ -177,7 +177,7 @@ class Tracker:
         return DloImage(pixels, self._scale, self._dlo, covered > 0)
 
     def _alike(self, image: DloImage) -> Bools:
-        """Tell of each part of the sheet whether it hides the DLO, whose colour it has."""
+        """Tell which parts of the sheet have so much of the DLO's colour that they hide it."""
         found = np.zeros(len(self._sheet.parts), bool)
         if self._scale is not None:
             width = image.width(self._line.line)
