@@ -97,19 +97,20 @@ def elastic_line(image: DloImage, before: TrackedLine, shown: Shown) -> TrackedL
         excess = fit.excess(line)
         lift = lift.seen(line, fit.places, ~fit.hidden, MOVES * shown.half)
         # Behind an end that a hand holds is something else than beside it, and it may be in the air.
-        if lift.raises or (abs(excess) <= fit.tolerance / 4 if lift.held else excess >= -fit.tolerance):
+        fits = excess >= -fit.tolerance if lift.held is None else abs(excess) <= fit.tolerance / 4
+        if lift.raises or fits:
             return fit.between_ends(line, excess, lift)
         # What covers an end makes the DLO look shorter, and so does an end that is held in the air; both
         # move.  An end so high that the DLO looks longer has moved far, whatever is behind it.
-        if lift.held:
-            signs = lift.ends if excess > fit.tolerance else lift.strange
+        if lift.held is None:
+            unsure = int(np.argmax(np.linalg.norm(fit.places - before.line[[0, -1]], axis=1)))
         else:
-            signs = np.linalg.norm(fit.places - before.line[[0, -1]], axis=1)
-        accepted[int(np.argmax(signs))] = False
+            unsure = int(np.argmax(lift.ends)) if excess > fit.tolerance else lift.held
+        accepted[unsure] = False
     ends = (bool(accepted[0]), bool(accepted[1]))
     found = replace(before, line=fit.through(accepted), ends=ends, excess=0.0, lift=lift)
     held = int(np.argmin(accepted))
-    if not any(accepted) or not lift.held:
+    if not any(accepted) or lift.held is None:
         return found
     # The DLO does not end before the hand that holds its end.  Where that end is not seen, it looks as long
     # as before.

@@ -34,7 +34,8 @@ class Lift:
 
     :param rested: (n, 2) the line when last all of it lay on the table [px].
     :param strange: (2,) distance in L, a, b of what is behind an end from what is beside it, as a mean.
-    :param held: whether a hand seems to hold an end: something else was behind it than behind the other one.
+    :param held: the end that a hand seems to hold, 0 or 1: something else was behind it than behind the other
+        one; None: neither.
     :param ends: (2,) how far the ends have been from where they rested [px].
     :param middle: how far a part that was hidden has been [px].
     :param raises: whether a hand seems to lift the middle, and not an end.
@@ -43,7 +44,7 @@ class Lift:
 
     rested: Floats
     strange: Floats
-    held: bool
+    held: int | None
     ends: Floats
     middle: float
     raises: bool
@@ -52,13 +53,14 @@ class Lift:
     @classmethod
     def of(cls, line: Floats, strange: Floats) -> Lift:
         """Return the state of a line that lies on the table: nothing is lifted."""
-        return cls(line, strange, False, np.zeros(2), 0.0, False, (len(line) - 1) / 2)
+        return cls(line, strange, None, np.zeros(2), 0.0, False, (len(line) - 1) / 2)
 
     def behind(self, strange: Sequence[float | None]) -> Lift:
         """Return the state with what an image shows behind both ends; None: it does not show that end."""
         means = [mean if new is None else mean + NEWEST * (new - mean)
                  for new, mean in zip(strange, self.strange.tolist(), strict=True)]
-        return replace(self, strange=np.array(means), held=self.held or abs(means[0] - means[1]) > HELD)
+        held = int(np.argmax(means)) if abs(means[0] - means[1]) > HELD else self.held
+        return replace(self, strange=np.array(means), held=held)
 
     def seen(self, line: Floats, ends: Floats, shown: Bools, least: float) -> Lift:
         """
@@ -79,7 +81,7 @@ class Lift:
         moved = np.maximum(self.ends, np.linalg.norm(ends - self.rested[[0, -1]], axis=1))
         # It may come back before an end does; both ends slide towards it.
         surplus = middle * (CHANGED if self.raises else 1.0)
-        raises = not self.held and (surplus > moved.max() or moved.min() > BOTH * moved.max())
+        raises = self.held is None and (surplus > moved.max() or moved.min() > BOTH * moved.max())
         return replace(self, ends=moved, middle=middle, centre=centre,
                        raises=bool(raises and max(middle, moved.max()) > least))
 

@@ -59,14 +59,18 @@ def test_a_hand_behind_an_end_holds_that_end():
     lift = Lift.of(LINE, np.zeros(2))
     for _ in range(5):
         lift = lift.behind([12.0, 1.0])
-    assert lift.held
+    assert lift.held == 0
     assert not lift.seen(LINE, ends, hidden(30), LEAST).raises
     # An end that is not seen changes nothing, and images that show less do not, until the DLO rests.
-    assert lift.behind([None, None]).held
+    assert lift.behind([None, None]).held == 0
     for _ in range(10):
-        lift = lift.behind([1.0, 1.0])
-    assert lift.held
-    assert not Lift.of(LINE, lift.strange).behind([1.0, 1.0]).held
+        lift = lift.behind([1.0, 2.0])
+    assert lift.held == 0
+    assert Lift.of(LINE, lift.strange).behind([1.0, 1.0]).held is None
+    # A hand behind the other end holds that one.
+    for _ in range(5):
+        lift = lift.behind([1.0, 12.0])
+    assert lift.held == 1
 
 
 def test_nothing_moved_and_nothing_is_raised():
