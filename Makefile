@@ -4,7 +4,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := help
-.PHONY: help demo experiment test lint sanitize aarch64 bench soak figures clean
+.PHONY: help demo experiment test jazzy lint sanitize aarch64 bench soak figures clean
 
 VENV := .venv
 PYTHON := $(VENV)/bin/python
@@ -49,6 +49,7 @@ help:
 	  make test    run the tests; some that take long are left to make soak
 	  make experiment   repeat the paper's experiment on the samples: consistency and validity, as tables;
 	               then execute plans with fitted, default and true parameters: what calibration is worth
+	  make jazzy   run the tests with the libraries of Ubuntu 24.04, on which ROS 2 Jazzy is used
 	  make lint    run the checks of style, types, imports and packaging alone
 	  make sanitize   run the tests of the engines with a core that checks its memory and its arithmetic
 	  make aarch64    compile the core for ARM, with Zig of PyPI
@@ -73,6 +74,12 @@ test: $(TESTED)
 	@$(with_headers)
 	cores=$$(nproc)
 	$(PYTHON) -m pytest --numprocesses $$((cores < 4 ? cores + 1 : 4)) --dist worksteal --durations 10 $(ARGUMENTS)
+
+# Those of PyPI are newer: their users miss what breaks with these.
+jazzy:
+	@export UV_CONSTRAINT=$(abspath test/ubuntu-24.04.txt)
+	export PIP_CONSTRAINT=$$UV_CONSTRAINT
+	$(MAKE) --no-print-directory test VENV=build/jazzy
 
 lint: $(TESTED)
 	@$(PYTHON) -m pytest -m '' $(LINT)

@@ -142,7 +142,7 @@ class _MjcfWriter:
         across = mass * (length**2 / 12 + rope.radius**2 / 4)
         if k == 0:
             body = add(parent, 'body', name=f'{NAME}_0', pos=_text(rope.points[0]),
-                       quat=_text(_quaternions(Rotation.from_matrix(rope.frames[0]))), childclass=NAME)
+                       quat=_text(_quaternions(rope.turns[0])), childclass=NAME)
             add(body, 'freejoint', name=f'{NAME}_root')
         else:
             turn = rope.rest_turns[k - 1]
@@ -179,10 +179,10 @@ class _MjcfWriter:
 
     def _start(self) -> Floats:
         """Return the positions of all joints at the observed chain."""
-        frames = Rotation.from_matrix(self._rope.frames)
-        bends = _quaternions(self._rope.rest_turns.inv() * frames[:-1].inv() * frames[1:])
+        turns = self._rope.turns
+        bends = _quaternions(self._rope.rest_turns.inv() * turns[:-1].inv() * turns[1:])
         joints = np.column_stack([np.zeros(len(bends)), bends]) if self._stretches else bends
-        return np.concatenate([self._rope.points[0], _quaternions(frames[0]), joints.ravel()])
+        return np.concatenate([self._rope.points[0], _quaternions(turns[0]), joints.ravel()])
 
     def _stretched(self) -> Floats:
         """Return the length [m] whose stretch each inner node has, (n - 2,); the ends' halves are added."""

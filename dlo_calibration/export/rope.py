@@ -107,6 +107,11 @@ class ExportedRope:
         return bool(self.rest_lengths.min() > 2 * self.radius)
 
     @property
+    def turns(self) -> Rotation:
+        """The n - 1 rotations of the segments at the start."""
+        return Rotation.from_matrix(self.frames.copy())  # SciPy 1.11 cannot read what must not be written
+
+    @property
     def rest_turns(self) -> Rotation:
         """The n - 2 rotations from each segment to the next in the rest shape: towards the curvature."""
         bends = self.natural_curvature * self.cells[:, None]

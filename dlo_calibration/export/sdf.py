@@ -127,7 +127,7 @@ def _add_friction(collision: Any, coefficient: float) -> None:
 def _add_link(model: Any, rope: ExportedRope, segment: int, start: Floats) -> None:
     """Add a link whose frame lies at the start of the segment, (3,) [m], x along it."""
     link, length = add(model, 'link', name=f'{NAME}_{segment}'), float(rope.rest_lengths[segment])
-    turn = Rotation.from_matrix(rope.frames[segment]).as_quat(canonical=True)
+    turn = rope.turns[segment].as_quat(canonical=True)
     pose = _add(link, 'pose', [*start, *turn])
     pose.set('rotation_format', 'quat_xyzw')
     _add_inertia(link, rope, segment)

@@ -109,9 +109,14 @@ def write_figure(figure: Figure, path: str | Path) -> None:
 
 def add_legend(figure: FigureBase, axes: Sequence[Axes], columns: int = 4) -> None:
     """Add a legend below the figure for all `axes`, with each label once."""
+    from matplotlib.collections import PolyCollection
+    from matplotlib.patches import Patch
+
     shown: dict[str, Any] = {}
     for subplot in axes:
         for handle, label in zip(*subplot.get_legend_handles_labels(), strict=True):
+            if isinstance(handle, PolyCollection):  # Matplotlib 3.6 takes none of a part of the figure
+                handle = Patch(facecolor=handle.get_facecolor()[0], edgecolor=handle.get_edgecolor()[0])
             shown.setdefault(label, handle)
     legend_outside(figure, 'lower center', handles=list(shown.values()), labels=list(shown),
                    ncols=min(columns, len(shown)))

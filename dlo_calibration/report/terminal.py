@@ -60,12 +60,14 @@ class _Bar:
 
     def __enter__(self) -> Self:
         """Show it."""
-        self._progress.start()
+        if self.shown:
+            self._progress.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         """Stop updating; the bar stays visible."""
-        self._progress.stop()
+        if self.shown:  # of one that was not, rich 13 ends the line
+            self._progress.stop()
 
 
 class SearchBar(_Bar):

@@ -7,7 +7,7 @@ from itertools import pairwise, product
 
 import numpy as np
 import pytest
-from scipy.sparse import coo_array
+from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from dlo_calibration.vision import path
@@ -72,7 +72,7 @@ def test_no_other_path_costs_less(seed):
     source = 16 * width * height  # which leads to all states near the first click
     links += [(source, k, begins[k]) for k in np.nonzero(np.isfinite(begins))[0]]
     rows, columns, costs = zip(*links, strict=True)
-    graph = coo_array((costs, (rows, columns)), shape=(source + 1, source + 1)).tocsr()
+    graph = coo_matrix((costs, (rows, columns)), shape=(source + 1, source + 1)).tocsr()
     least = (dijkstra(graph, indices=source)[:-1] + ends).min()
 
     pixels = path.ridge_path(ridge, np.array([first, last]), reach).astype(int)
