@@ -116,7 +116,8 @@ def add_legend(figure: FigureBase, axes: Sequence[Axes], columns: int = 4) -> No
     for subplot in axes:
         for handle, label in zip(*subplot.get_legend_handles_labels(), strict=True):
             if isinstance(handle, PolyCollection):  # Matplotlib 3.6 takes none of a part of the figure
-                handle = Patch(facecolor=handle.get_facecolor()[0], edgecolor=handle.get_edgecolor()[0])
+                area: Any = handle  # its stubs do not say that it has a list of colours
+                handle = Patch(facecolor=area.get_facecolor()[0], edgecolor=area.get_edgecolor()[0])
             shown.setdefault(label, handle)
     legend_outside(figure, 'lower center', handles=list(shown.values()), labels=list(shown),
                    ncols=min(columns, len(shown)))
