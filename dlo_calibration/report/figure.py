@@ -125,11 +125,17 @@ def add_legend(figure: FigureBase, axes: Sequence[Axes], columns: int = 4) -> No
 
 def legend_outside(figure: FigureBase, place: str, **rest: Any) -> None:
     """Put a legend beside the axes; `rest` is of `Figure.legend`."""
+    from matplotlib.figure import Figure
+
     add: Any = figure.legend  # its overloads do not know what is passed on
     try:
         add(loc=f'outside {place}', frameon=False, **rest)
-    except ValueError:  # Matplotlib 3.6, which Ubuntu 24.04 has, puts legends over the axes only
-        add(loc=place, frameon=False, **rest)
+    except ValueError:  # Matplotlib 3.6, which Ubuntu 24.04 has, leaves no room for it
+        legend = add(loc=place, frameon=False, **rest)
+        if isinstance(figure, Figure):  # not a part of one
+            layout: Any = figure.get_layout_engine()
+            box = legend.get_window_extent().transformed(figure.transFigure.inverted())
+            layout.set(rect=(0, box.y1, 1, 1 - box.y1) if place.startswith('lower') else (0, 0, 1, box.y0))
 
 
 def as_text(name: str) -> str:

@@ -37,6 +37,7 @@ def test_chains_and_bands_are_drawn(prediction, tmp_path):
     step = prediction.steps[0]
     thin = replace(step, lower=step.chain - 1e-6, upper=step.chain + 1e-6)
     with_band, without = (picture(replace(prediction, steps=(one,)), tmp_path) for one in (step, thin))
+    assert count(with_band[-60:], BAND) > 50  # the legend explains it
     assert count(with_band, SIMULATED) > 500
     assert count(with_band, BAND) > 3 * count(without, BAND)
 
