@@ -6,9 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
-import cv2
 import numpy as np
 
 from dlo_calibration.model.chain import Floats
@@ -17,6 +15,7 @@ from dlo_calibration.vision.dlo_image import DloImage
 from dlo_calibration.vision.middle_line import (
     along_line,
     arc_lengths,
+    colours_at,
     edge_near,
     end_near,
     evenly,
@@ -32,6 +31,7 @@ CLEAR = 1.5  # half widths behind that part, which the picture must show
 LONGEST_TIP = 14  # half widths by which the line may be too short
 FAN = np.radians(np.arange(-50.0, 51.0, 10.0))  # directions in which the DLO may go on
 REACHES = np.array([0.4, 0.8, 1.2, 1.6])  # half widths, where colours are read in each of them
+SAME = 4.0  # distance in L, a, b of what is behind an end from what was there, up to which it is the same
 SIDES = np.array([-2.6, -2.2, -1.8, 1.8, 2.2, 2.6])  # half widths beside the DLO, where the ground is seen
 
 
@@ -41,8 +41,8 @@ class LineEnd:
     An end that is seen.
 
     :param place: (2,) [px].
-    :param strange: distance in L, a, b of what is behind it from what is beside it, which is large where
-        something covers the DLO from there on.
+    :param strange: distance in L, a, b of what is behind it from what the first image shows there, or else
+        from what is beside it; large where something covers the DLO from there on.
     """
 
     place: Floats
@@ -87,11 +87,14 @@ def end_of(image: DloImage, half: float, measured: Floats, quality: Floats,
     # The ground beside the last part, and what is behind the end.
     beside = straighten(image.pixels, way, halves, SIDES).lab
     last = (arc > end + 0.5 * half) & (arc < end + 5 * half)
-    behind = strip.lab[inside & (arc < end - 0.8 * half) & (arc > end - 3.0 * half)].reshape(-1, 3)
-    if not len(behind) or not last.any():
+    behind = inside & (arc < end - 0.8 * half) & (arc > end - 3.0 * half)
+    if not behind.any() or not last.any():
         return None
-    sides = [beside[last][:, part].reshape(-1, 3).mean(axis=0) for part in (slice(0, 3), slice(3, 6))]
-    strange = min(float(np.linalg.norm(behind.mean(axis=0) - side)) for side in sides)
+    there = strip.lab[behind].reshape(-1, 3).mean(axis=0)
+    strange = float(np.linalg.norm(there - image.first_colour(way[behind])))
+    if strange > SAME:
+        sides = [beside[last][:, part].reshape(-1, 3).mean(axis=0) for part in (slice(0, 3), slice(3, 6))]
+        strange = min(float(np.linalg.norm(there - side)) for side in sides)
     return LineEnd(np.asarray(along_line(way, arc, [end])[0]), strange)
 
 
@@ -101,10 +104,7 @@ def _tip(image: DloImage, begin: Floats, towards: Floats, half: float) -> tuple[
     for _ in range(LONGEST_TIP):
         turned = np.stack([np.cos(FAN), np.sin(FAN)], axis=1)
         ways = np.stack([turned @ (towards * (1, -1)), turned @ towards[::-1]], axis=1)
-        at = (points[-1] + half * REACHES[:, None] * ways[:, None]).astype(np.float32)
-        colours: Any = cv2.remap(image.pixels, at[..., 0], at[..., 1], cv2.INTER_LINEAR,
-                                 borderMode=cv2.BORDER_REPLICATE)
-        lab: Any = cv2.cvtColor(colours.astype(np.float32) / np.float32(255), cv2.COLOR_RGB2Lab)
+        lab = colours_at(image.pixels, points[-1] + half * REACHES[:, None] * ways[:, None])
         logarithms = odds(image.dlo.colours, lab).mean(axis=1, dtype=float)
         best = int(np.argmax(logarithms - FAN ** 2))
         if logarithms[best] < SEEN:

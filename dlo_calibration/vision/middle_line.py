@@ -343,6 +343,15 @@ def straighten(pixels: NDArray[np.uint8], line: Floats, half: Floats, offsets: F
     return Strip(line, normals, half, offsets, lab)
 
 
+def colours_at(pixels: NDArray[np.uint8], places: Floats) -> Singles:
+    """Return the colours L, a, b (n, m, 3) of an image at places (n, m, 2) [px]."""
+    at = places.astype(np.float32)
+    colours: Any = cv2.remap(pixels, at[..., 0], at[..., 1], cv2.INTER_LINEAR,
+                             borderMode=cv2.BORDER_REPLICATE)
+    lab: Any = cv2.cvtColor(colours.astype(np.float32) / np.float32(255), cv2.COLOR_RGB2Lab)
+    return np.asarray(lab)
+
+
 def learn_colours(strip: Strip, inner: float, outer: tuple[float, float], others: float = 0.0) -> Singles:
     """
     Return a table of the logarithm of the odds that a colour is the DLO's.

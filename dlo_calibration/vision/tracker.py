@@ -113,7 +113,8 @@ class Tracker:
         self._velocity: Floats = np.zeros_like(line)
         self._lost_for = 0
         self._shown = 1.0
-        self._hide = self._alike(DloImage(pixels, scale, self._dlo))
+        self._first = DloImage(pixels, scale, self._dlo)
+        self._hide = self._alike(self._first)
         image = self._image(pixels)
         _, free, own = elsewhere(image, line, self._shown)
         # Where it is thin or blurred, less than its area has its colour.
@@ -168,13 +169,13 @@ class Tracker:
     def _image(self, pixels: Pixels) -> DloImage:
         """Return an image in which the parts of the sheet that hide the DLO are covered."""
         if self._scale is None or not self._hide.any():
-            return DloImage(pixels, self._scale, self._dlo)
+            return DloImage(pixels, self._scale, self._dlo, first=self._first)
         covered = self._sheet.drawn(self._scale, pixels.shape[:2], self._hide)
         u, v, width, height = cv2.boundingRect(covered)
         part = np.s_[v:v + height, u:u + width]
         pixels = pixels.copy()
         pixels[part][covered[part] > 0] = COVER
-        return DloImage(pixels, self._scale, self._dlo, covered > 0)
+        return DloImage(pixels, self._scale, self._dlo, covered > 0, self._first)
 
     def _alike(self, image: DloImage) -> Bools:
         """Tell which parts of the sheet have so much of the DLO's colour that they hide it."""

@@ -123,6 +123,19 @@ def test_a_hidden_end_does_not_shift_the_points():
 
 
 @pytest.mark.long
+def test_paper_that_lay_on_the_table_from_the_beginning_does_not_cover_an_end_before_it():
+    corners = CAMERA.project([[x, y, 0.0] for x, y in ((0.512, -0.1), (0.6, -0.1), (0.6, 0.1), (0.512, 0.1))])
+
+    def with_paper(pixels, _):
+        return cv2.fillConvexPoly(pixels.copy(), np.rint(corners).astype(np.int32), (235, 235, 230))
+
+    # The hand pushes the DLO towards the paper; it covers the other end.
+    curves = [bent(0.2, (0.001 * min(max(k - 4, 0), 12), 0.0)) for k in range(16)]
+    hands = [()] * 3 + [(Hand((curve[0, 0] + 0.01, curve[0, 1])),) for curve in curves[3:]]
+    assert np.nanmax(errors(tracked(curves, hands, drawn=with_paper)[-1], curves[-1])) < FAR
+
+
+@pytest.mark.long
 def test_where_a_hand_covers_an_end_is_no_end_though_the_other_end_is_hidden():
     def drawn(pixels, k):
         edges = ((-0.05, 0.005 * max(k - 4, 0)), (0.35, 0.55)) if k else ()
