@@ -75,7 +75,7 @@ test: $(TESTED)
 	cores=$$(nproc)
 	$(PYTHON) -m pytest --numprocesses $$((cores < 4 ? cores + 1 : 4)) --dist worksteal --durations 10 $(ARGUMENTS)
 
-# Those of PyPI are newer: their users miss what breaks with these.
+# `make test` has the newest libraries of PyPI; some code that they run, these older ones refuse.
 jazzy:
 	@export UV_CONSTRAINT=$(abspath test/ubuntu-24.04.txt)
 	export PIP_CONSTRAINT=$$UV_CONSTRAINT

@@ -85,7 +85,7 @@ setup(
         'matplotlib>=3.6',
         'mcap>=1.6',
         'numpy>=1.26',
-        'opencv-python-headless>=4.7',  # those of PyPI before find no markers
+        'opencv-python-headless>=4.7',  # earlier ones of PyPI find no markers
         'pillow>=9.4',
         'pybullet>=3.2.5; python_version < "3.12"',  # for later ones PyPI has no binary
         'PyYAML>=6.0',

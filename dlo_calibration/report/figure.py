@@ -115,7 +115,7 @@ def add_legend(figure: FigureBase, axes: Sequence[Axes], columns: int = 4) -> No
     shown: dict[str, Any] = {}
     for subplot in axes:
         for handle, label in zip(*subplot.get_legend_handles_labels(), strict=True):
-            if isinstance(handle, PolyCollection):  # Matplotlib 3.6 takes none of a part of the figure
+            if isinstance(handle, PolyCollection):  # Matplotlib 3.6 takes none of a subfigure
                 area: Any = handle  # its stubs do not say that it has a list of colours
                 handle = Patch(facecolor=area.get_facecolor()[0], edgecolor=area.get_edgecolor()[0])
             shown.setdefault(label, handle)
@@ -132,7 +132,7 @@ def legend_outside(figure: FigureBase, place: str, **rest: Any) -> None:
         add(loc=f'outside {place}', frameon=False, **rest)
     except ValueError:  # Matplotlib 3.6, which Ubuntu 24.04 has, leaves no room for it
         legend = add(loc=place, frameon=False, **rest)
-        if isinstance(figure, Figure):  # not a part of one
+        if isinstance(figure, Figure):  # a subfigure has no layout of its own
             layout: Any = figure.get_layout_engine()
             box = legend.get_window_extent().transformed(figure.transFigure.inverted())
             layout.set(rect=(0, box.y1, 1, 1 - box.y1) if place.startswith('lower') else (0, 0, 1, box.y0))

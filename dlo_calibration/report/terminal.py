@@ -55,11 +55,11 @@ class _Bar:
                  **fields: Any) -> None:
         self.shown = shown and stream.isatty()
         self._progress = Progress(TextColumn(label), BarColumn(), MofNCompleteColumn(), *columns,
-                                  console=console(stream), disable=not self.shown)
+                                  console=console(stream))
         self._task = self._progress.add_task('', **fields)
 
     def __enter__(self) -> Self:
-        """Show it."""
+        """Show it, unless it shall not be."""
         if self.shown:
             self._progress.start()
         return self

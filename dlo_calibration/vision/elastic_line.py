@@ -109,18 +109,18 @@ def elastic_line(image: DloImage, before: TrackedLine, shown: Shown) -> TrackedL
         accepted[unsure] = False
     ends = (bool(accepted[0]), bool(accepted[1]))
     found = replace(before, line=fit.through(accepted), ends=ends, excess=0.0, lift=lift)
-    held = int(np.argmin(accepted))
+    unsure = int(np.argmin(accepted))
     if not any(accepted) or lift.held is None:
         return found
     # The DLO does not end before the hand that holds its end.  Where that end is not seen, it looks as long
     # as before.
     whole, excess = found.line, before.excess
-    if shown.ends[held] is not None:
+    if shown.ends[unsure] is not None:
         whole = fit.through(np.full(2, True), LOOSE)
         excess = fit.excess(whole)
     if not fit.tolerance < excess < LONGEST:
         return found
-    lifted = fit.lifted(whole, excess, replace(lift, centre=held * (len(whole) - 1.0)))
+    lifted = fit.lifted(whole, excess, replace(lift, centre=unsure * (len(whole) - 1.0)))
     return replace(found, line=lifted, excess=excess)
 
 

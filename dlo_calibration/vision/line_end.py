@@ -84,15 +84,14 @@ def end_of(image: DloImage, half: float, measured: Floats, quality: Floats,
     if end is None:
         return None
     end = edge_near(arc, strip, end, 0.5 * half)
-    # The ground beside the last part, and what is behind the end.
-    beside = straighten(image.pixels, way, halves, SIDES).lab
     last = (arc > end + 0.5 * half) & (arc < end + 5 * half)
     behind = inside & (arc < end - 0.8 * half) & (arc > end - 3.0 * half)
     if not behind.any() or not last.any():
         return None
     there = strip.lab[behind].reshape(-1, 3).mean(axis=0)
     strange = float(np.linalg.norm(there - image.first_colour(way[behind])))
-    if strange > SAME:
+    if strange > SAME:  # the ground beside the last part may be the same, as in a shadow
+        beside = straighten(image.pixels, way, halves, SIDES).lab
         sides = [beside[last][:, part].reshape(-1, 3).mean(axis=0) for part in (slice(0, 3), slice(3, 6))]
         strange = min(float(np.linalg.norm(there - side)) for side in sides)
     return LineEnd(np.asarray(along_line(way, arc, [end])[0]), strange)

@@ -334,20 +334,16 @@ def straighten(pixels: NDArray[np.uint8], line: Floats, half: Floats, offsets: F
     low = np.maximum(np.floor(at.min(axis=(0, 1))).astype(int) - 2, 0)
     high = np.ceil(at.max(axis=(0, 1))).astype(int) + 3
     part = pixels[low[1]:max(high[1], low[1] + 1), low[0]:max(high[0], low[0] + 1)]
-    places = (at - low).astype(np.float32)
-    # OpenCV's remap takes at most 32767 rows, and reads whatever is aligned.
-    colours = np.concatenate([
-        cv2.remap(part, places[k:k + 16384, :, 0], places[k:k + 16384, :, 1], cv2.INTER_LINEAR,
-                  borderMode=cv2.BORDER_REPLICATE) for k in range(0, len(places), 16384)])
-    lab: Any = cv2.cvtColor(colours.astype(np.float32) / np.float32(255), cv2.COLOR_RGB2Lab)
-    return Strip(line, normals, half, offsets, lab)
+    return Strip(line, normals, half, offsets, colours_at(part, at - low))
 
 
 def colours_at(pixels: NDArray[np.uint8], places: Floats) -> Singles:
     """Return the colours L, a, b (n, m, 3) of an image at places (n, m, 2) [px]."""
     at = places.astype(np.float32)
-    colours: Any = cv2.remap(pixels, at[..., 0], at[..., 1], cv2.INTER_LINEAR,
-                             borderMode=cv2.BORDER_REPLICATE)
+    # OpenCV's remap takes at most 32767 rows, and reads whatever is aligned.
+    colours = np.concatenate([
+        cv2.remap(pixels, at[k:k + 16384, :, 0], at[k:k + 16384, :, 1], cv2.INTER_LINEAR,
+                  borderMode=cv2.BORDER_REPLICATE) for k in range(0, len(at), 16384)])
     lab: Any = cv2.cvtColor(colours.astype(np.float32) / np.float32(255), cv2.COLOR_RGB2Lab)
     return np.asarray(lab)
 
