@@ -40,6 +40,7 @@ FEWEST_CORNERS = 8  # of 48: a third of the sheet, which still determines how it
 FEWEST_MARKERS = 3
 ENOUGH_CORNERS = 36  # that make the search in full resolution needless
 REDUCED = 1600  # px, of the longer side, for the first search for markers
+ENLARGED = 4000  # px, of the longer side, up to which a picture is searched at twice its size
 SMALLEST = 0.01  # perimeter of a marker, of the picture's longer side; OpenCV itself takes 0.03
 
 _ARUCO: Any = cv2.aruco  # of any version
@@ -121,7 +122,8 @@ def find_board(pixels: Pixels, printed: float = RULER) -> tuple[Floats, Floats]:
                          f'{0.5 * RULER:g} m to {2.0 * RULER:g} m', 'measure it in metres')
     grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
     best = np.zeros((0, 2)), np.zeros((0, 2))
-    for longest in dict.fromkeys((min(REDUCED, max(grey.shape)), max(grey.shape))):
+    full = max(grey.shape)
+    for longest in dict.fromkeys((min(REDUCED, full), full, 2 * full if 2 * full <= ENLARGED else full)):
         markers = _markers(grey, longest)
         for paper in PAPERS.values():
             seen, places = _corners(grey, {number - paper.first: marker for number, marker in markers.items()
@@ -147,6 +149,7 @@ def _detected(grey: Pixels) -> tuple[Any, Any]:
     new = hasattr(_ARUCO, 'ArucoDetector')
     options = _ARUCO.DetectorParameters() if new else _ARUCO.DetectorParameters_create()
     options.minMarkerPerimeterRate = SMALLEST
+    options.errorCorrectionRate = 1.0  # a misread marker does not lie where the others say (`_consistent`)
     if new:
         corners, numbers, _ = _ARUCO.ArucoDetector(_dictionary(), options).detectMarkers(grey)
     else:
@@ -155,11 +158,12 @@ def _detected(grey: Pixels) -> tuple[Any, Any]:
 
 
 def _markers(grey: Pixels, longest: int) -> dict[int, Floats]:
-    """Return the corners (4, 2) [px] of each marker, found in the picture reduced to a longer side [px]."""
+    """Return the corners (4, 2) [px] of each marker, found in the picture scaled to a longer side [px]."""
     scale = longest / max(grey.shape)
     height, width = (round(scale * side) for side in grey.shape)
-    small = grey if scale == 1.0 else cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
-    corners, numbers = _detected(small)
+    way = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC
+    scaled = grey if scale == 1.0 else cv2.resize(grey, (width, height), interpolation=way)
+    corners, numbers = _detected(scaled)
     back = np.array([grey.shape[1] / width, grey.shape[0] / height])
     return {int(number): (marker.reshape(4, 2).astype(float) + 0.5) * back - 0.5
             for number, marker in zip([] if numbers is None else np.ravel(numbers), corners, strict=True)}
