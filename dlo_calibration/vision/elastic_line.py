@@ -101,11 +101,11 @@ def elastic_line(image: DloImage, before: TrackedLine, shown: Shown) -> TrackedL
         if lift.raises or fits:
             return fit.between_ends(line, excess, lift)
         # What covers an end makes the DLO look shorter, and so does an end that is held in the air; both
-        # move.  An end so high that the DLO looks longer has moved far, whatever is behind it.
+        # move.  Of ends that look alike, one so high that the DLO looks longer has moved far.
         if lift.held is None:
             unsure = int(np.argmax(np.linalg.norm(fit.places - before.line[[0, -1]], axis=1)))
         else:
-            unsure = int(np.argmax(lift.ends)) if excess > fit.tolerance else lift.held
+            unsure = int(np.argmax(lift.ends)) if lift.alike and excess > fit.tolerance else lift.held
         accepted[unsure] = False
     ends = (bool(accepted[0]), bool(accepted[1]))
     found = replace(before, line=fit.through(accepted), ends=ends, excess=0.0, lift=lift)

@@ -55,12 +55,17 @@ class Lift:
         """Return the state of a line that lies on the table: nothing is lifted."""
         return cls(line, strange, None, np.zeros(2), 0.0, False, (len(line) - 1) / 2)
 
+    @property
+    def alike(self) -> bool:
+        """Whether what is behind both ends does not tell which of them a hand holds."""
+        return bool(abs(self.strange[0] - self.strange[1]) <= HELD)
+
     def behind(self, strange: Sequence[float | None]) -> Lift:
         """Return the state with what an image shows behind both ends; None: it does not show that end."""
         means = [mean if new is None else mean + NEWEST * (new - mean)
                  for new, mean in zip(strange, self.strange.tolist(), strict=True)]
-        held = int(np.argmax(means)) if abs(means[0] - means[1]) > HELD else self.held
-        return replace(self, strange=np.array(means), held=held)
+        found = replace(self, strange=np.array(means))
+        return found if found.alike else replace(found, held=int(np.argmax(means)))
 
     def seen(self, line: Floats, ends: Floats, shown: Bools, least: float) -> Lift:
         """

@@ -84,6 +84,9 @@ def end_of(image: DloImage, half: float, measured: Floats, quality: Floats,
     if end is None:
         return None
     end = edge_near(arc, strip, end, 0.5 * half)
+    place = np.asarray(along_line(way, arc, [end])[0])
+    if not image.inside(place + CLEAR * half * _fan(towards), 0.0).all():
+        return None  # it may be the corner of what is seen of the DLO beside something that is covered
     last = (arc > end + 0.5 * half) & (arc < end + 5 * half)
     behind = inside & (arc < end - 0.8 * half) & (arc > end - 3.0 * half)
     if not behind.any() or not last.any():
@@ -94,15 +97,14 @@ def end_of(image: DloImage, half: float, measured: Floats, quality: Floats,
         beside = straighten(image.pixels, way, halves, SIDES).lab
         sides = [beside[last][:, part].reshape(-1, 3).mean(axis=0) for part in (slice(0, 3), slice(3, 6))]
         strange = min(float(np.linalg.norm(there - side)) for side in sides)
-    return LineEnd(np.asarray(along_line(way, arc, [end])[0]), strange)
+    return LineEnd(place, strange)
 
 
 def _tip(image: DloImage, begin: Floats, towards: Floats, half: float) -> tuple[Floats, Floats]:
     """Follow the DLO's colour from a point (2,) [px]; return the points (n, 2) and the last direction."""
     points = [begin]
     for _ in range(LONGEST_TIP):
-        turned = np.stack([np.cos(FAN), np.sin(FAN)], axis=1)
-        ways = np.stack([turned @ (towards * (1, -1)), turned @ towards[::-1]], axis=1)
+        ways = _fan(towards)
         lab = colours_at(image.pixels, points[-1] + half * REACHES[:, None] * ways[:, None])
         logarithms = odds(image.dlo.colours, lab).mean(axis=1, dtype=float)
         best = int(np.argmax(logarithms - FAN ** 2))
@@ -111,3 +113,9 @@ def _tip(image: DloImage, begin: Floats, towards: Floats, half: float) -> tuple[
         towards = ways[best]
         points.append(points[-1] + half * towards)
     return np.array(points), towards
+
+
+def _fan(towards: Floats) -> Floats:
+    """Return the directions (k, 2) of the fan around one (2,)."""
+    turned = np.stack([np.cos(FAN), np.sin(FAN)], axis=1)
+    return np.stack([turned @ (towards * (1, -1)), turned @ towards[::-1]], axis=1)
