@@ -27,7 +27,7 @@ class Evidence:
     :param along: (n,) weight of that, along the line.
     :param anywhere: weight of that, in all directions.
     :param lengths: (n - 1,) of the segments [px].
-    :param stretch: weight of a segment's length.
+    :param stretch: (n - 1,) weight of each of these lengths.
     :param bend: weight of the second differences of `expected`.
     :param kept: (n - 2,) share of those second differences that remains; below 1, the line becomes straight.
     :param ends: (2, 2) where both ends are seen [px].
@@ -40,7 +40,7 @@ class Evidence:
     along: Floats
     anywhere: float
     lengths: Floats
-    stretch: float
+    stretch: Floats
     bend: float
     kept: Floats
     ends: Floats
@@ -59,7 +59,7 @@ def fitted(start: Floats, known: Evidence) -> Floats:
         normal.add(tangents[:, None], _along(tangents, known.expected), known.along)
         segments = np.diff(line, axis=0)
         units = segments / np.maximum(np.linalg.norm(segments, axis=1, keepdims=True), 1e-9)
-        normal.add(np.stack([-units, units], axis=1), known.lengths, np.full(len(units), known.stretch))
+        normal.add(np.stack([-units, units], axis=1), known.lengths, known.stretch)
         everywhere = np.full(len(line), known.anywhere)
         for axis in np.eye(2):
             normal.add(np.broadcast_to(axis, (len(line), 1, 2)), known.expected @ axis, everywhere)

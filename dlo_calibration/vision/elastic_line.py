@@ -13,12 +13,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
 
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.vision.appearance import Bools
 from dlo_calibration.vision.dlo_image import DloImage
-from dlo_calibration.vision.elastic import directions, Evidence, fitted
+from dlo_calibration.vision.elastic import Evidence, fitted
 from dlo_calibration.vision.lift import Lift
 from dlo_calibration.vision.line_end import LineEnd
 from dlo_calibration.vision.middle_line import arc_lengths
@@ -29,9 +28,9 @@ LOOSE = 0.01  # of the weight of the lengths, where it is measured how long the 
 BEND = 0.01  # half widths, standard deviation of a change of second differences from image to image
 KEPT = 0.9  # share of the bends that the line keeps from image to image where the DLO is not seen
 FREE = (10.0, 1.5)  # half widths, deviation from where the line is expected: if an end is seen, or none
-STILL = 0.02  # the same along a part that does not move, while another part is in the air
 END = 0.1  # half widths, standard deviation of an end
 HIDDEN = 0.1  # of the weight of the place that is seen best, below which one is hidden
+GUESSED = 0.2  # of a segment's length: standard deviation of how long a part in the air looks
 SHORTEST = 0.4  # share by which a segment in the air can look shorter
 LONGEST = 1.0  # the same by which the DLO can look longer, as one high above the table does
 MOVES = 0.12  # half widths from image to image, from which on a part moves
@@ -135,11 +134,11 @@ class _Fit:
         self.places = np.array([shown.near[k] if end is None else end.place
                                 for k, end in zip((0, -1), shown.ends, strict=True)])
         stretch = UNSCALED_STRETCH if image.scale is None else STRETCH
+        lengths_known = np.full(count - 1, 1.0 / (stretch * float(self._lengths.mean())) ** 2)
         self._known = Evidence(
             shown.measured, shown.across, shown.expected, np.full(count, 1.0 / (FREE[0] * half) ** 2),
-            0.2 / (FREE[0] * half) ** 2, self._lengths, 1.0 / (stretch * float(self._lengths.mean())) ** 2,
-            1.0 / (BEND * half) ** 2, np.where(before.seen[1:-1], 1.0, KEPT),
-            self.places, np.full(2, 1.0 / (END * half) ** 2))
+            0.2 / (FREE[0] * half) ** 2, self._lengths, lengths_known, 1.0 / (BEND * half) ** 2,
+            np.where(before.seen[1:-1], 1.0, KEPT), self.places, np.full(2, 1.0 / (END * half) ** 2))
         self.hidden = shown.across <= HIDDEN * shown.across.max()
         self.tolerance = UNSCALED if image.scale is None else TOLERANCE
         self.tolerance += BLURRED / float(arc_lengths(shown.near)[-1])
@@ -166,19 +165,14 @@ class _Fit:
         found = replace(self._before, line=line, ends=(True, True), excess=excess, lift=lift)
         if abs(excess) <= self.tolerance:
             return replace(found, lift=Lift.of(line, lift.strange))
-        if lift.raises:
-            return replace(found, line=self.lifted(line, excess, lift))
-        # A part in the air looks longer: it is one that moves, or is hidden.
-        tangents = directions(self._shown.near)
-        normals = np.column_stack([-tangents[:, 1], tangents[:, 0]])
-        change = np.abs(((line - self._before.line) * normals).sum(axis=1))
-        loose = (change > MOVES * self._shown.half) | self.hidden
-        moving = gaussian_filter1d(loose.astype(float), 3.0, mode='nearest')
-        still = np.where(moving > 0.05, self._known.along, 1.0 / (STILL * self._shown.half) ** 2)
-        return replace(found, line=fitted(line, replace(self._known, along=still)))
+        if not lift.raises:  # the DLO looks longer: it is an end that is in the air
+            lift = replace(lift, centre=int(np.argmax(lift.ends)) * (len(line) - 1.0))
+        return replace(found, line=self.lifted(line, excess, lift))
 
     def lifted(self, line: Floats, excess: float, lift: Lift) -> Floats:
         """Return a line near another one (n, 2), of which a part in the air looks longer, or shorter."""
         share = lift.share(len(line) - 1)
         looks = np.maximum(excess * share / share.mean(), -SHORTEST)
-        return fitted(line, replace(self._known, lengths=self._lengths * (1.0 + looks)))
+        unsure = 1.0 + np.square(GUESSED * share) * self._known.stretch * np.square(self._lengths)
+        return fitted(line, replace(self._known, lengths=self._lengths * (1.0 + looks),
+                                    stretch=self._known.stretch / unsure))
