@@ -40,6 +40,7 @@ from photographs import Camera, Hand, Look  # noqa: E402
 
 from dlo_calibration.calibration.engines import make_simulator  # noqa: E402
 from dlo_calibration.calibration.options import Options  # noqa: E402
+from dlo_calibration.errors import InputError  # noqa: E402
 from dlo_calibration.model.chain import Chain, Floats  # noqa: E402
 from dlo_calibration.model.named_actions import Drag, GraspAndPlace, NamedAction  # noqa: E402
 from dlo_calibration.model.trial import Goal, Trial  # noqa: E402
@@ -278,7 +279,7 @@ def clicks(number: int, listed: Sequence[Moment]) -> Floats:
 
 
 def report(number: int, folder: Path) -> dict[str, Any]:
-    """Track the DLO in a film, and return what came out."""
+    """Track the DLO in a film, and return what came out, or why it was refused."""
     path, listed = rendered(number, folder)
     radius = scene(number).radius
     truth = [BOARD.seen_from(moment.chain) for moment in listed]
@@ -290,8 +291,11 @@ def report(number: int, folder: Path) -> dict[str, Any]:
     for k, chain in enumerate(truth):
         watch = time.perf_counter()
         frame = next(frames)
-        view = observer.next(frame.time, frame.pixels) if k else observer.start(
-            frame.time, frame.pixels, clicks(number, listed))
+        try:
+            view = observer.next(frame.time, frame.pixels) if k else observer.start(
+                frame.time, frame.pixels, clicks(number, listed))
+        except InputError as refused:
+            return {'images': len(truth), 'refused': str(refused)}
         spent += time.perf_counter() - watch
         if view.scale is None or view.tracked.lost:
             lost.append(frame.time)
@@ -358,10 +362,13 @@ def resident_mb(process: int) -> float:
 
 def text_of(reports: Mapping[int, dict[str, Any]], memories: Sequence[dict[str, Any]]) -> str:
     """Return the tables."""
+    refused = {number: own for number, own in reports.items() if 'refused' in own}
+    reports = {number: own for number, own in reports.items() if number not in refused}
     rows = [(number, 'in the hand' if scene(number).held else 'on a stand', own['images'],
              f'{own["mean_mm"]:.2f}', f'{own["worst_image_mm"]:.1f}', f'{own["worst_point_mm"]:.1f}',
              f'{100 * (1 - len(own["lost"]) / own["images"]):.1f} %', len(own['wrong']),
              f'{own["images_per_s"]:.1f}') for number, own in reports.items()]
+    rows += [(number, 'refused', own['images'], *['-'] * 6) for number, own in refused.items()]
     total = sum(own['images'] for own in reports.values())
     rows.append(('all', '', total, f'{np.mean([own["mean_mm"] for own in reports.values()]):.2f}',
                  *(f'{max(own[key] for own in reports.values()):.1f}'
@@ -371,7 +378,7 @@ def text_of(reports: Mapping[int, dict[str, Any]], memories: Sequence[dict[str, 
                  f'{np.mean([own["images_per_s"] for own in reports.values()]):.1f}'))
     columns = ('film', 'camera', 'images', 'points on the table off by, mm', 'worst image, mm',
                'worst point, mm', 'tracked', 'wrong images, not said', 'images a second')
-    tables = [table(columns, rows)]
+    tables = [table(columns, rows), *(f'{number}: {own["refused"]}' for number, own in refused.items())]
     if memories:
         tables.append(table(('film, s', 'memory of `track` and its decoder at most, MB'),
                             [(f'{own["seconds"]:.0f}', f'{own["memory_mb"]:.0f}') for own in memories]))

@@ -11,7 +11,8 @@ import numpy as np
 
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.vision.appearance import Appearance, Bools, finenesses
-from dlo_calibration.vision.middle_line import arc_lengths, colours_at
+from dlo_calibration.vision.ground import Ground
+from dlo_calibration.vision.middle_line import arc_lengths
 from dlo_calibration.vision.photograph import Pixels
 from dlo_calibration.vision.scale import Scale
 
@@ -24,15 +25,15 @@ class DloImage:
     :param pixels: (h, w, 3) RGB.
     :param scale: None: lengths are those in the picture.
     :param dlo: what it looks like.
+    :param ground: on which it lies.
     :param covered: (h, w) where something of its colour would hide it; None: nowhere.
-    :param first: the first image; None: this is it.
     """
 
     pixels: Pixels
     scale: Scale | None
     dlo: Appearance
+    ground: Ground
     covered: Bools | None = None
-    first: DloImage | None = None
 
     def finenesses(self, line: Floats) -> Floats:
         """Return the pixels (n - 1,) to a unit of the length, of each segment of a line (n, 2)."""
@@ -59,10 +60,3 @@ class DloImage:
             u, v = np.clip(np.rint(np.where(found[:, None], points, 0.0)), 0, most).astype(int).T
             found &= ~self.covered[v, u]
         return found
-
-    def first_colour(self, points: Floats) -> Floats:
-        """Return the mean colour L, a, b of what the first image shows at points (n, 2) [px] of this one."""
-        first = self.first or self
-        if first.scale is not None and self.scale is not None and first.scale is not self.scale:
-            points = first.scale.to_pixels(self.scale.points(points))
-        return np.asarray(colours_at(first.pixels, points[:, None]).mean(axis=(0, 1), dtype=float))

@@ -99,13 +99,12 @@ def elastic_line(image: DloImage, before: TrackedLine, shown: Shown) -> TrackedL
         fits = excess >= -fit.tolerance if lift.held is None else abs(excess) <= fit.tolerance / 4
         if lift.raises or fits:
             return fit.between_ends(line, excess, lift)
-        # What covers an end makes the DLO look shorter, and so does an end that is held in the air; both
-        # move.  Of ends that look alike, one so high that the DLO looks longer has moved far.
-        if lift.held is None:
-            unsure = int(np.argmax(np.linalg.norm(fit.places - before.line[[0, -1]], axis=1)))
-        else:
-            unsure = int(np.argmax(lift.ends)) if lift.alike and excess > fit.tolerance else lift.held
+        # What covers an end makes the DLO look shorter, as does an end that is held in the air; both move.
+        moved = np.linalg.norm(fit.places - before.line[[0, -1]], axis=1)
+        unsure = int(np.argmax(moved)) if lift.held is None else lift.held
         accepted[unsure] = False
+        if min(covered) > STRANGE:  # a hand covers both
+            accepted[:] = False
     ends = (bool(accepted[0]), bool(accepted[1]))
     found = replace(before, line=fit.through(accepted), ends=ends, excess=0.0, lift=lift)
     unsure = int(np.argmin(accepted))

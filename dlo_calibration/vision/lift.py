@@ -20,7 +20,7 @@ from dlo_calibration.model.chain import Floats
 from dlo_calibration.vision.appearance import Bools
 
 BESIDE = 2.0  # points: standard deviation of a filter, which tells what is beside a hidden part
-HELD = 4.0  # difference between both ends, from which on a hand seems to hold one of them
+HELD = 6.0  # difference between both ends, from which on a hand seems to hold one of them
 NEWEST = 0.3  # share of what is new in an image
 BOTH = 0.3  # share of the way of the end that moved farthest, from which on the other one moved, too
 CHANGED = 4.0  # times as far: from then on a hand seems to hold an end after all
@@ -33,9 +33,7 @@ class Lift:
     Which part of a line a hand seems to lift.
 
     :param rested: (n, 2) the line when last all of it lay on the table [px].
-    :param strange: (2,) distance in L, a, b of what is behind an end from what is beside it, as a mean.
-    :param held: the end that a hand seems to hold, 0 or 1: something else was behind it than behind the other
-        one; None: neither.
+    :param strange: (2,) distance in L, a, b of what is behind an end from the ground, as a mean over images.
     :param ends: (2,) how far the ends have been from where they rested [px].
     :param middle: how far a part that was hidden has been [px].
     :param raises: whether a hand seems to lift the middle, and not an end.
@@ -44,7 +42,6 @@ class Lift:
 
     rested: Floats
     strange: Floats
-    held: int | None
     ends: Floats
     middle: float
     raises: bool
@@ -53,19 +50,18 @@ class Lift:
     @classmethod
     def of(cls, line: Floats, strange: Floats) -> Lift:
         """Return the state of a line that lies on the table: nothing is lifted."""
-        return cls(line, strange, None, np.zeros(2), 0.0, False, (len(line) - 1) / 2)
+        return cls(line, strange, np.zeros(2), 0.0, False, (len(line) - 1) / 2)
 
     @property
-    def alike(self) -> bool:
-        """Whether what is behind both ends does not tell which of them a hand holds."""
-        return bool(abs(self.strange[0] - self.strange[1]) <= HELD)
+    def held(self) -> int | None:
+        """The end that a hand seems to hold, 0 or 1: it is stranger than the other one; None: neither."""
+        return int(np.argmax(self.strange)) if abs(self.strange[0] - self.strange[1]) > HELD else None
 
     def behind(self, strange: Sequence[float | None]) -> Lift:
         """Return the state with what an image shows behind both ends; None: it does not show that end."""
         means = [mean if new is None else mean + NEWEST * (new - mean)
                  for new, mean in zip(strange, self.strange.tolist(), strict=True)]
-        found = replace(self, strange=np.array(means))
-        return found if found.alike else replace(found, held=int(np.argmax(means)))
+        return replace(self, strange=np.array(means))
 
     def seen(self, line: Floats, ends: Floats, shown: Bools, least: float) -> Lift:
         """

@@ -31,8 +31,7 @@ CLEAR = 1.5  # half widths behind that part, which the picture must show
 LONGEST_TIP = 14  # half widths by which the line may be too short
 FAN = np.radians(np.arange(-50.0, 51.0, 10.0))  # directions in which the DLO may go on
 REACHES = np.array([0.4, 0.8, 1.2, 1.6])  # half widths, where colours are read in each of them
-SAME = 4.0  # distance in L, a, b of what is behind an end from what was there, up to which it is the same
-SIDES = np.array([-2.6, -2.2, -1.8, 1.8, 2.2, 2.6])  # half widths beside the DLO, where the ground is seen
+BEHIND = np.array([0.8, 1.2, 1.6, 2.0, 2.4, 2.8])  # half widths, where it is seen what is behind an end
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +40,8 @@ class LineEnd:
     An end that is seen.
 
     :param place: (2,) [px].
-    :param strange: distance in L, a, b of what is behind it from what the first image shows there, or else
-        from what is beside it; large where something covers the DLO from there on.
+    :param strange: distance in L, a, b of what is behind it from the ground there, in whatever light; large
+        where something covers the DLO from there on.
     """
 
     place: Floats
@@ -87,17 +86,18 @@ def end_of(image: DloImage, half: float, measured: Floats, quality: Floats,
     place = np.asarray(along_line(way, arc, [end])[0])
     if not image.inside(place + CLEAR * half * _fan(towards), 0.0).all():
         return None  # it may be the corner of what is seen of the DLO beside something that is covered
-    last = (arc > end + 0.5 * half) & (arc < end + 5 * half)
-    behind = inside & (arc < end - 0.8 * half) & (arc > end - 3.0 * half)
-    if not behind.any() or not last.any():
-        return None
-    there = strip.lab[behind].reshape(-1, 3).mean(axis=0)
-    strange = float(np.linalg.norm(there - image.first_colour(way[behind])))
-    if strange > SAME:  # the ground beside the last part may be the same, as in a shadow
-        beside = straighten(image.pixels, way, halves, SIDES).lab
-        sides = [beside[last][:, part].reshape(-1, 3).mean(axis=0) for part in (slice(0, 3), slice(3, 6))]
-        strange = min(float(np.linalg.norm(there - side)) for side in sides)
-    return LineEnd(place, strange)
+    return LineEnd(place, _strange(image, place, half, towards, colours))
+
+
+def _strange(image: DloImage, place: Floats, half: float, towards: Floats, colours: Singles) -> float:
+    """Return how strange it is behind an end (2,) [px]: the most in any direction in which the DLO is not."""
+    behind = place + half * BEHIND[:, None] * _fan(towards)[:, None]
+    there = colours_at(image.pixels, behind)
+    others = odds(colours, there).mean(axis=1) < SEEN
+    others &= image.inside(behind.reshape(-1, 2), 0.0).reshape(there.shape[:2]).all(axis=1)
+    if not others.any():
+        return 0.0
+    return float(image.ground.differences(there[others], behind[others], image.scale, colours).max())
 
 
 def _tip(image: DloImage, begin: Floats, towards: Floats, half: float) -> tuple[Floats, Floats]:

@@ -20,10 +20,11 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter1d
 
 from dlo_calibration.model.chain import Floats, frozen_array
-from dlo_calibration.vision.appearance import Appearance, Bools
+from dlo_calibration.vision.appearance import Appearance, Bools, finenesses
 from dlo_calibration.vision.dlo_image import DloImage
 from dlo_calibration.vision.elastic_line import TrackedLine
 from dlo_calibration.vision.followed_line import FAR, followed
+from dlo_calibration.vision.ground import Ground
 from dlo_calibration.vision.lift import Lift
 from dlo_calibration.vision.line_search import (
     bridge,
@@ -113,8 +114,9 @@ class Tracker:
         self._velocity: Floats = np.zeros_like(line)
         self._lost_for = 0
         self._shown = 1.0
-        self._first = DloImage(pixels, scale, self._dlo)
-        self._hide = self._alike(self._first)
+        halves = self._dlo.half * finenesses(line, scale)
+        self._ground = Ground(pixels, scale, line, np.append(halves, halves[-1]))
+        self._hide = self._alike(DloImage(pixels, scale, self._dlo, self._ground))
         image = self._image(pixels)
         _, free, own = elsewhere(image, line, self._shown)
         # Where it is thin or blurred, less than its area has its colour.
@@ -169,13 +171,13 @@ class Tracker:
     def _image(self, pixels: Pixels) -> DloImage:
         """Return an image in which the parts of the sheet that hide the DLO are covered."""
         if self._scale is None or not self._hide.any():
-            return DloImage(pixels, self._scale, self._dlo, first=self._first)
+            return DloImage(pixels, self._scale, self._dlo, self._ground)
         covered = self._sheet.drawn(self._scale, pixels.shape[:2], self._hide)
         u, v, width, height = cv2.boundingRect(covered)
         part = np.s_[v:v + height, u:u + width]
         pixels = pixels.copy()
         pixels[part][covered[part] > 0] = COVER
-        return DloImage(pixels, self._scale, self._dlo, covered > 0, self._first)
+        return DloImage(pixels, self._scale, self._dlo, self._ground, covered > 0)
 
     def _alike(self, image: DloImage) -> Bools:
         """Tell which parts of the sheet have so much of the DLO's colour that they hide it."""
@@ -228,7 +230,7 @@ class Tracker:
             return None
         same, turned = (np.linalg.norm(ends - line[[0, -1]], axis=1).sum()
                         for ends in (path[[0, -1]], path[[-1, 0]]))
-        return self._checked(image, path[::-1] if same > turned else path, WHOLE)
+        return self._checked(image, path[::-1] if same > turned else path, whole=True)
 
     def _rejoined(self, image: DloImage, found: TrackedLine) -> TrackedLine | None:
         """Return the line that goes on where its rest comes out of what hides it; None: none is sure."""
@@ -245,10 +247,10 @@ class Tracker:
         between = bridge(image, line[-BRIDGED:], path[:BRIDGED], rest)
         if between is None:
             return None
-        return self._checked(image, np.concatenate([line, between, path])[::order], LEAST)
+        return self._checked(image, np.concatenate([line, between, path])[::order], whole=False)
 
-    def _checked(self, image: DloImage, rough: Floats, least: float) -> TrackedLine | None:
-        """Return the line near a rough one (n, 2) [px], of which so much is seen; None: it is not sure."""
+    def _checked(self, image: DloImage, rough: Floats, whole: bool) -> TrackedLine | None:
+        """Return the line near a rough one (n, 2) [px], from end to end if whole; None: it is not sure."""
         smooth = gaussian_filter1d(evenly(rough, image.width(self._line.line) / REDUCED), 3.0, axis=0,
                                    mode='nearest')
         count = len(self._line.line)
@@ -256,9 +258,10 @@ class Tracker:
         if not abs(arc[-1] / self._dlo.length - 1) < 2 * WRONG_LENGTH:
             return None
         line = along_line(smooth, arc, np.linspace(0, arc[-1], count))
-        rests = TrackedLine(line, np.ones(count, bool), (True, True), 0.0, Lift.of(line, np.zeros(2)))
+        rests = TrackedLine(line, np.ones(count, bool), (True, True), 0.0,
+                            Lift.of(line, self._line.lift.strange))
         found = followed(image, rests, line, FAR[1])
-        if (self._doubt(image, found) or found.seen.mean() < least or not all(found.ends)
-                or abs(found.excess) > WRONG_LENGTH):
-            return None
-        return found
+        # Where a hand holds an end, how long the rest of the DLO looks is not known.
+        sure = all(found.ends) and (not whole or found.seen.mean() >= WHOLE) or (
+            not whole and any(found.ends) and found.lift.held is None)
+        return found if sure and abs(found.excess) < WRONG_LENGTH and not self._doubt(image, found) else None
