@@ -33,7 +33,8 @@ class Lift:
     Which part of a line a hand seems to lift.
 
     :param rested: (n, 2) the line when last all of it lay on the table [px].
-    :param strange: (2,) distance in L, a, b of what is behind an end from the ground, as a mean over images.
+    :param strange: (2,) distance in L, a, b of what is behind an end from the ground, as a mean over images;
+        not a number: no image has shown it yet.
     :param ends: (2,) how far the ends have been from where they rested [px].
     :param middle: how far a part that was hidden has been [px].
     :param raises: whether a hand seems to lift the middle, and not an end.
@@ -59,7 +60,7 @@ class Lift:
 
     def behind(self, strange: Sequence[float | None]) -> Lift:
         """Return the state with what an image shows behind both ends; None: it does not show that end."""
-        means = [mean if new is None else mean + NEWEST * (new - mean)
+        means = [mean if new is None else new if np.isnan(mean) else mean + NEWEST * (new - mean)
                  for new, mean in zip(strange, self.strange.tolist(), strict=True)]
         return replace(self, strange=np.array(means))
 

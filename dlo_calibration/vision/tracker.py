@@ -259,7 +259,7 @@ class Tracker:
             return None
         line = along_line(smooth, arc, np.linspace(0, arc[-1], count))
         rests = TrackedLine(line, np.ones(count, bool), (True, True), 0.0,
-                            Lift.of(line, self._line.lift.strange))
+                            Lift.of(line, np.full(2, np.nan)))
         found = followed(image, rests, line, FAR[1])
         # Where a hand holds an end, how long the rest of the DLO looks is not known.
         sure = all(found.ends) and (not whole or found.seen.mean() >= WHOLE) or (
