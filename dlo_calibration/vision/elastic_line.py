@@ -95,7 +95,7 @@ def elastic_line(image: DloImage, before: TrackedLine, shown: Shown) -> TrackedL
         line = fit.through(accepted)
         excess = fit.excess(line)
         lift = lift.seen(line, fit.places, ~fit.hidden, MOVES * shown.half)
-        # Behind an end that a hand holds is something else than beside it, and it may be in the air.
+        # An end that a hand holds may be in the air.
         fits = excess >= -fit.tolerance if lift.held is None else abs(excess) <= fit.tolerance / 4
         if lift.raises or fits:
             return fit.between_ends(line, excess, lift)

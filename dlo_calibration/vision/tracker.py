@@ -261,7 +261,8 @@ class Tracker:
         rests = TrackedLine(line, np.ones(count, bool), (True, True), 0.0,
                             Lift.of(line, np.full(2, np.nan)))
         found = followed(image, rests, line, FAR[1])
-        # Where a hand holds an end, how long the rest of the DLO looks is not known.
-        sure = all(found.ends) and (not whole or found.seen.mean() >= WHOLE) or (
-            not whole and any(found.ends) and found.lift.held is None)
+        if whole:
+            sure = all(found.ends) and found.seen.mean() >= WHOLE
+        else:  # where a hand holds an end, how long the rest of the DLO looks is not known
+            sure = all(found.ends) or any(found.ends) and found.lift.held is None
         return found if sure and abs(found.excess) < WRONG_LENGTH and not self._doubt(image, found) else None
