@@ -75,6 +75,11 @@ class Appearance:
         return cls(float(arc_lengths(flat)[-1]), half / fineness, colours, marked, marks,
                    ALIKE * float(np.median(looks)))
 
+    def halves(self, line: Floats, scale: Scale | None) -> Floats:
+        """Return half its width (n,) [px] at each point of a line (n, 2) in a picture."""
+        fineness = finenesses(line, scale)
+        return np.asarray(self.half * np.append(fineness, fineness[-1]))
+
     def colours_near(self, order: int) -> Singles:
         """Return the table near the first end (order 1) or the last one (-1)."""
         return self.marks if self.marked[::order][:MARKED].any() else self.colours

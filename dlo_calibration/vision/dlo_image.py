@@ -41,8 +41,7 @@ class DloImage:
 
     def halves(self, line: Floats) -> Floats:
         """Return half the width (n,) of the DLO [px] at each point of a line (n, 2)."""
-        fineness = self.finenesses(line)
-        return np.asarray(self.dlo.half * np.append(fineness, fineness[-1]))
+        return self.dlo.halves(line, self.scale)
 
     def width(self, line: Floats) -> float:
         """Return the width of the DLO [px] along a line (n, 2)."""

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter1d
 
 from dlo_calibration.model.chain import Floats, frozen_array
-from dlo_calibration.vision.appearance import Appearance, Bools, finenesses
+from dlo_calibration.vision.appearance import Appearance, Bools
 from dlo_calibration.vision.dlo_image import DloImage
 from dlo_calibration.vision.elastic_line import TrackedLine
 from dlo_calibration.vision.followed_line import FAR, followed
@@ -114,8 +114,7 @@ class Tracker:
         self._velocity: Floats = np.zeros_like(line)
         self._lost_for = 0
         self._shown = 1.0
-        halves = self._dlo.half * finenesses(line, scale)
-        self._ground = Ground(pixels, scale, line, np.append(halves, halves[-1]))
+        self._ground = Ground(pixels, scale, line, self._dlo.halves(line, scale))
         self._hide = self._alike(DloImage(pixels, scale, self._dlo, self._ground))
         image = self._image(pixels)
         _, free, own = elsewhere(image, line, self._shown)
