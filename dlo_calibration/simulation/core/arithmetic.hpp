@@ -128,8 +128,8 @@ inline Point operator*(const Matrix& m, const Point& p) {
 }
 
 // Angles.  The functions of the C library differ in their last bit from processor to processor; these use only
-// sums, products, quotients and roots, and do not.  Errors are below 3e-16 (Taylor series of the reduced
-// argument).
+// sums, products, quotients and roots, and do not.  Errors of sine and cosine are below 3e-16, those of the angle
+// below two units in the last place (Taylor series of the reduced argument).
 
 struct Rotation {
   double cosine, sine;
