@@ -19,6 +19,7 @@ from dlo_calibration.vision.scale import Scale
 
 SHADED = 2.2  # half widths from the middle of the DLO to the ground beside it and its shadow
 BLACK = np.array([-16.0, 0.0, 0.0])  # L, a, b of a surface without light, as its cube root goes on
+NOTHING = 1e3  # distance in L, a, b, larger than any between colours
 LIGHT = (0.65, 1.1)  # L + 16, a, b of the ground in a shadow, or in more light, to those in the first image
 
 
@@ -42,11 +43,11 @@ class Ground:
         """
         Return the distances (k,) in L, a, b of what an image shows from the ground, in whatever light.
 
-        Where the DLO lay, the ground may be that on either side of it; what looks like the DLO is no ground,
-        and differs from nothing.  Light from a surface is proportional to that on it, and so are the cubes of
-        L + 16, a and b (CIE 1976).
+        Where the DLO or its shadow lay, the ground may be that on either side of it.  What looks like the DLO
+        is no ground; a point for which nothing else is known differs from nothing.  Light from a surface is
+        proportional to that on it, and so are the cubes of L + 16, a and b (CIE 1976).
 
-        :param lab: (k, m, 3) colours, of which the means over m are compared.
+        :param lab: (k, m, 3) colours, of which the means over m are compared; each point has its own ground.
         :param points: (k, m, 2) where the image shows them [px].
         :param scale: of that image.
         :param dlo: table of the logarithm of the odds that a colour is the DLO's, as `odds` reads it.
@@ -54,15 +55,16 @@ class Ground:
         flat = points.reshape(-1, 2)
         if self.scale is not None and scale is not None and self.scale is not scale:
             flat = self.scale.to_pixels(scale.points(flat))
-        seen = lab.mean(axis=1, dtype=float) - BLACK
-        distances = []
-        for places in self._beside(flat):
+        seen = lab.astype(float) - BLACK
+        candidates, distances = [seen], [np.full(seen.shape[:2], NOTHING)]
+        for places in (flat, *self._beside(flat)):
             colours = colours_at(self.pixels, places.reshape(points.shape))
-            lit = colours.mean(axis=1, dtype=float) - BLACK
-            light = np.clip((seen * lit).sum(axis=1) / (lit * lit).sum(axis=1), *LIGHT)
-            known = odds(dlo, colours).mean(axis=1) < SEEN
-            distances.append(np.where(known, np.linalg.norm(seen - light[:, None] * lit, axis=1), 0.0))
-        return np.asarray(np.minimum(*distances))
+            candidates.append(_lit(colours - BLACK, seen))
+            distance = np.linalg.norm(seen - candidates[-1], axis=2)
+            distances.append(np.where(odds(dlo, colours) < SEEN, distance, np.inf))
+        nearest = np.argmin(distances, axis=0)[None, ..., None]
+        ground = np.take_along_axis(np.array(candidates), nearest, axis=0)[0].mean(axis=1)
+        return np.asarray(np.linalg.norm(seen.mean(axis=1) - ground, axis=1))
 
     def _beside(self, points: Floats) -> tuple[Floats, Floats]:
         """Return points (m, 2) [px] where the DLO is not: those on it are moved to the left, to the right."""
@@ -74,3 +76,9 @@ class Ground:
         covered = (distance.min(axis=1) < reach)[:, None]
         left, right = (np.where(covered, self.line[nearest] + sign * aside, points) for sign in (-1.0, 1.0))
         return left, right
+
+
+def _lit(colours: Floats, seen: Floats) -> Floats:
+    """Return colours (..., 3), relative to `BLACK`, in the light in which they are nearest to other ones."""
+    light = (seen * colours).sum(axis=-1) / (colours * colours).sum(axis=-1)
+    return np.asarray(np.clip(light, *LIGHT)[..., None] * colours)

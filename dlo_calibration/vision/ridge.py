@@ -32,6 +32,7 @@ NEAR = 14.0  # px in a photograph of 4000 px: usual distance of a click from the
 FAR = 5.0
 STRONGEST = 0.85  # share of the strongest ridge that a wider level must have to be preferred
 GROUND = 0.8  # share of the pixels that count as the ground's
+LIGHTNESS = 10.0  # L for a logarithm of the odds of 1
 ANGLES = np.arange(16) * (math.pi / 16)
 
 
@@ -50,6 +51,31 @@ class Level:
     lab: Singles
     curvature: Singles
     inverse: Floats
+
+    @classmethod
+    def reduced(cls, lab: Singles, factor: float) -> Level:
+        """Return the level of a reduced photograph (h, w, 3) L, a, b."""
+        smooth = cv2.GaussianBlur(lab, (0, 0), BLUR, borderType=cv2.BORDER_REPLICATE)
+        curvature = np.empty((*lab.shape[:2], 3, 3), dtype=np.float32)
+        for k, (dx, dy) in enumerate(((2, 0), (1, 1), (0, 2))):
+            # Sobel's kernels of 3 pixels sum up to 4.
+            curvature[:, :, k] = cv2.Sobel(smooth, cv2.CV_32F, dx, dy, ksize=3, scale=0.25,
+                                           borderType=cv2.BORDER_REPLICATE)
+        sample = curvature[::2, ::2, ::2].reshape(-1, 3)  # xx and yy
+        covariance: Floats = np.eye(3)
+        for _ in range(2):
+            # The DLO itself and its shadow do not count.
+            size = np.einsum('ni,ij,nj->n', sample, np.linalg.inv(covariance), sample)
+            ground = sample[size <= np.quantile(size, GROUND)]
+            covariance = ground.T @ ground / len(ground) + 0.05 * np.eye(3)
+        inverse: Floats = np.linalg.inv(covariance).astype(float)
+        return cls(factor, lab, curvature, inverse)
+
+    def of(self, looks: Singles) -> Level:
+        """Return the same level of how much each pixel (h, w) of the finest one looks like the DLO."""
+        lab = np.zeros_like(self.lab)
+        lab[..., 0] = cv2.resize(LIGHTNESS * looks, lab.shape[1::-1], interpolation=cv2.INTER_AREA)
+        return Level.reduced(lab, self.factor)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,30 +104,12 @@ def levels(pixels: NDArray[np.uint8]) -> list[Level]:
     while not reduced_levels or longer / factor >= COARSEST:
         height, width = (max(8, round(side / factor)) for side in pixels.shape[:2])
         reduced = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-        reduced_levels.append(_level(reduced, factor))
+        lab: Any = cv2.cvtColor(reduced.astype(np.float32) / np.float32(255), cv2.COLOR_RGB2Lab)
+        reduced_levels.append(Level.reduced(lab, factor))
         if factor <= longer / FINEST * 2:
             image = reduced if factor > 1 else image
         factor *= math.sqrt(2)
     return reduced_levels
-
-
-def _level(reduced: NDArray[Any], factor: float) -> Level:
-    lab: Any = cv2.cvtColor(reduced.astype(np.float32) / np.float32(255), cv2.COLOR_RGB2Lab)
-    smooth = cv2.GaussianBlur(lab, (0, 0), BLUR, borderType=cv2.BORDER_REPLICATE)
-    curvature = np.empty((*lab.shape[:2], 3, 3), dtype=np.float32)
-    for k, (dx, dy) in enumerate(((2, 0), (1, 1), (0, 2))):
-        # Sobel's kernels of 3 pixels sum up to 4.
-        curvature[:, :, k] = cv2.Sobel(smooth, cv2.CV_32F, dx, dy, ksize=3, scale=0.25,
-                                       borderType=cv2.BORDER_REPLICATE)
-    sample = curvature[::2, ::2, ::2].reshape(-1, 3)  # xx and yy
-    covariance: Floats = np.eye(3)
-    for _ in range(2):
-        # The DLO itself and its shadow do not count.
-        size = np.einsum('ni,ij,nj->n', sample, np.linalg.inv(covariance), sample)
-        ground = sample[size <= np.quantile(size, GROUND)]
-        covariance = ground.T @ ground / len(ground) + 0.05 * np.eye(3)
-    inverse: Floats = np.linalg.inv(covariance).astype(float)
-    return Level(factor, lab, curvature, inverse)
 
 
 def learn(levels: list[Level], clicks: Floats) -> Ridge:

@@ -15,10 +15,10 @@ from scipy.ndimage import gaussian_filter1d
 
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.chain import Floats, frozen_array
-from dlo_calibration.vision.middle_line import arc_lengths, between_ends, evenly, fit
+from dlo_calibration.vision.middle_line import arc_lengths, between_ends, evenly, fit, odds
 from dlo_calibration.vision.path import ridge_path
 from dlo_calibration.vision.photograph import Pixels
-from dlo_calibration.vision.ridge import learn, levels
+from dlo_calibration.vision.ridge import learn, Level, levels, Singles
 from dlo_calibration.writing import whole
 
 NEAR_END = 90.0  # px in a photograph of 4000 px: how far from the DLO's end the first and last clicks may be
@@ -26,6 +26,7 @@ CLICK = 80.0  # px in a photograph of 4000 px: how far beside the DLO a click ma
 APART = 0.4  # of the distance to the next click: beyond, it could stand for another place of the DLO
 SPACING = 3.0  # px between the points of a trace, in a photograph of 4000 px
 SEEN = 0.3  # share of the line that must be sure, else there is no DLO
+UNSURE_END = 1.5  # widths that are not sure at an end: then the line is looked for again
 ABOVE = 1.35  # least ratio of the upper strand's edge strength to the lower one's
 LINE, UNSURE, POINTS = (0, 220, 255), (255, 60, 0), (255, 255, 0)  # red, green, blue
 OUTLINE = (0, 0, 0)
@@ -89,8 +90,18 @@ class Tracer:
             DLO along them.
         """
         places = self._checked(clicks)
+        trace, table = self._along(self._levels, places, clamped)
+        if _unsure_end(trace):
+            # Something else led the line astray, say the edge of a sheet: its colours are not the DLO's.
+            looks = odds(table, self._levels[0].lab)
+            again, _ = self._along([level.of(looks) for level in self._levels], places, clamped)
+            trace = max(trace, again, key=lambda one: one.sure.mean())
+        return trace
+
+    def _along(self, reduced: list[Level], places: Floats, clamped: bool) -> tuple[Trace, Singles]:
+        """Return the trace along clicks (k, 2), and the table of the DLO's colours, as `odds` reads it."""
         scale = max(self._pixels.shape[:2]) / 4000
-        ridge = learn(self._levels, places)
+        ridge = learn(reduced, places)
         rough = ridge_path(ridge, places, _reaches(places, scale))
         if len(rough) < 2:
             raise _no_dlo()
@@ -102,7 +113,7 @@ class Tracer:
             raise _no_dlo()
         size = 2 * float(np.median(middle.half))
         return Trace(frozen_array(line), frozen_array(sure, bool), size,
-                     tuple(_crossings(line, strength, size)))
+                     tuple(_crossings(line, strength, size))), middle.table
 
     def _checked(self, clicks: ArrayLike) -> Floats:
         places = np.asarray(clicks, dtype=float)
@@ -121,6 +132,13 @@ class Tracer:
             raise InputError('clicks', 'all at one place', 'at least two places',
                              'click on both ends of the DLO')
         return np.asarray(np.clip(places[distinct], 0, (width - 1, height - 1)))
+
+
+def _unsure_end(trace: Trace) -> bool:
+    """Tell whether the first or last part of a line is not sure."""
+    least = UNSURE_END * trace.width
+    arc = arc_lengths(trace.pixels)
+    return not (trace.sure[arc < least].any() and trace.sure[arc > arc[-1] - least].any())
 
 
 def _reaches(clicks: Floats, scale: float) -> Floats:

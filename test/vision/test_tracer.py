@@ -8,7 +8,7 @@ from itertools import product
 import math
 
 import numpy as np
-from photographs import Camera, Hand, Look, photograph
+from photographs import Camera, Hand, Look, photograph, Sheet
 import pytest
 from rendered_scenes import distances, scene
 
@@ -198,3 +198,17 @@ def test_clicks_that_are_off_by_a_hundredth_of_the_picture_change_nothing(more):
     points, off = distances(example, lines[1])
     assert 1e3 * points[1:-1].mean() < 1.0 and 1e3 * off.max() < 2.0
     assert np.linalg.norm(lines[0][[0, -1]] - lines[1][[0, -1]], axis=1).max() < 2.0
+
+
+@pytest.mark.parametrize('turned', [0.1, pytest.param(0.2, marks=pytest.mark.long)])
+def test_the_edge_of_a_sheet_beside_an_end_does_not_lead_the_line_astray(turned):
+    arc = np.linspace(0.0, 0.6, 601)
+    curve = np.column_stack([arc, 0.02 * np.sin(9 * arc), np.full(601, 0.004)])
+    turn = math.atan2(*np.diff(curve[-2:, 1::-1], axis=0)[0]) - turned
+    along = np.array([math.cos(turn), math.sin(turn)])
+    corner = curve[-1, :2] - 0.2 * along - 0.216 * np.array([-along[1], along[0]])
+    sheet = Sheet(np.full((40, 40), 240, np.uint8), (0.3, 0.2), tuple(corner), turn)
+    camera = Camera((1280, 720), 1300.0, 0.2, 0.0, 0.0, 1.1, (0.3, 0.0))
+    look = Look(ground_colour=(0.42, 0.43, 0.45), colour=DARK, sheets=(sheet,), noise=2.5)
+    line = Tracer(photograph(camera, curve, 0.004, look)).trace(camera.project(curve[::150]) + (1, -2)).pixels
+    assert np.linalg.norm(line[[0, -1]] - camera.project(curve[[0, -1]]), axis=1).max() < OFF
