@@ -12,9 +12,11 @@ import numpy as np
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.vision.appearance import Appearance, Bools, finenesses
 from dlo_calibration.vision.ground import Ground
-from dlo_calibration.vision.middle_line import arc_lengths
+from dlo_calibration.vision.middle_line import arc_lengths, colours_at
 from dlo_calibration.vision.photograph import Pixels
 from dlo_calibration.vision.scale import Scale
+
+OTHER = 10.0  # distance in L, a, b from the ground, from which on a pixel shows something else
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +51,11 @@ class DloImage:
 
     def arc_lengths(self, line: Floats) -> Floats:
         """Return the length (n,) from the beginning of a line (n, 2) [px], in the DLO's unit."""
-        return arc_lengths(line if self.scale is None else self.scale.points(line))
+        return arc_lengths(self.flat(line))
+
+    def flat(self, line: Floats) -> Floats:
+        """Return a line (n, 2) [px] on the table (n, 3) [m]; without a scale, the line itself."""
+        return line if self.scale is None else self.scale.points(line)
 
     def inside(self, points: Floats, margin: float) -> Bools:
         """Tell which points (n, 2) [px] are farther than a margin within the picture, and not covered."""
@@ -59,3 +65,9 @@ class DloImage:
             u, v = np.clip(np.rint(np.where(found[:, None], points, 0.0)), 0, most).astype(int).T
             found &= ~self.covered[v, u]
         return found
+
+    def hides(self, points: Floats) -> Bools:
+        """Tell at which points (n, 2) [px] something covers the ground, or the picture does not show it."""
+        lab = colours_at(self.pixels, points[:, None])
+        strange = self.ground.differences(lab, points[:, None], self.scale, self.dlo.colours)
+        return np.asarray((strange > OTHER) | ~self.inside(points, 0.0))

@@ -91,6 +91,8 @@ def elastic_line(image: DloImage, before: TrackedLine, shown: Shown) -> TrackedL
     if (covered[most] > STRANGE > covered[1 - most]
             or not all(accepted) and lift.strange[most] > STRANGE_ALONE):
         accepted[most] = False
+    if min(covered) > STRANGE:  # a hand covers both
+        accepted[:] = False
     if all(accepted):
         line = fit.through(accepted)
         excess = fit.excess(line)
@@ -103,8 +105,6 @@ def elastic_line(image: DloImage, before: TrackedLine, shown: Shown) -> TrackedL
         moved = np.linalg.norm(fit.places - before.line[[0, -1]], axis=1)
         unsure = int(np.argmax(moved)) if lift.held is None else lift.held
         accepted[unsure] = False
-        if min(covered) > STRANGE:  # a hand covers both
-            accepted[:] = False
     ends = (bool(accepted[0]), bool(accepted[1]))
     found = replace(before, line=fit.through(accepted), ends=ends, excess=0.0, lift=lift)
     unsure = int(np.argmin(accepted))

@@ -5,13 +5,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from itertools import pairwise, permutations, product
+from typing import Any, Sequence
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
-from scipy.ndimage import distance_transform_edt, label
+from scipy.ndimage import distance_transform_edt, find_objects, label
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
@@ -19,13 +21,18 @@ from dlo_calibration.model.chain import Floats
 from dlo_calibration.vision.appearance import Bools
 from dlo_calibration.vision.dlo_image import DloImage
 from dlo_calibration.vision.elastic import directions
-from dlo_calibration.vision.middle_line import odds
+from dlo_calibration.vision.middle_line import arc_lengths, odds
 
 REDUCED = 4.0  # px, width of the DLO in the picture in which colours are counted
 LEAST_AREA = 2.0  # squares of the DLO's width: a smaller area is nothing
 THICKER = 1.7  # widths, from which on an area is another thing, say a hand
 WRONG_LENGTH = 0.05  # share of the length by which a line that is found again may differ
 LEAST_PATH = 8  # points
+CLOSED = 5  # px of the reduced picture: gaps in a path that are nothing
+TANGENT = 6  # points that tell the direction of a path where it is hidden
+PLACES = np.linspace(0.0, 1.0, 22)  # on a curve between two paths
+LONGEST_CURVE = 3.0  # slope at both ends of that curve, to its ends' distance
+LONGER = 0.15  # of the length, by which a DLO in the air may look longer
 
 
 def reduction(width: float) -> int:
@@ -43,12 +50,11 @@ def coloured(image: DloImage, width: float) -> Bools:
     return np.asarray(cv2.blur(odds(image.dlo.colours, lab), (side, side)) > image.dlo.alike)
 
 
-def elsewhere(image: DloImage, line: Floats, shown: float) -> tuple[Bools, float, float]:
+def shown_places(image: DloImage, line: Floats, shown: float) -> tuple[Bools, Bools]:
     """
-    Return where else than at a line (n, 2) the reduced picture shows the DLO.
+    Return where the reduced picture shows the DLO: at a line (n, 2) [px], and elsewhere.
 
     :param shown: share of the DLO's area that has its colour.
-    :returns: the places, and the areas elsewhere and at the line [px^2 of the picture].
     """
     width = image.width(line)
     factor, mask = reduction(width), coloured(image, width)
@@ -61,28 +67,34 @@ def elsewhere(image: DloImage, line: Floats, shown: float) -> tuple[Bools, float
     _, parts, each, _ = cv2.connectedComponentsWithStats(free)
     large = each[:, cv2.CC_STAT_AREA] * float(factor ** 2) > LEAST_AREA * shown * width ** 2
     large[0] = False
-    found, own = np.asarray(large[parts]), mask & (covered == 1)
-    return found, float(np.count_nonzero(found)) * factor ** 2, float(np.count_nonzero(own)) * factor ** 2
+    return mask & (covered == 1), np.asarray(large[parts])
 
 
-def largest_path(mask: Bools, factor: int) -> Floats | None:
-    """Return the path (n, 2) [px] along the largest area of a reduced picture; None: there is none."""
-    parts, number = label(mask, np.ones((3, 3)))
-    if not number:
-        return None
-    sizes = np.bincount(parts.ravel())[1:]
-    v, u = np.nonzero(parts == int(np.argmax(sizes)) + 1)
-    path = _longest(u, v, mask)
-    return path * factor if len(path) >= LEAST_PATH else None
+def area(mask: Bools, factor: int) -> float:
+    """Return the area of a reduced picture (h, w) [px^2 of the picture]."""
+    return float(np.count_nonzero(mask)) * factor ** 2
 
 
-def _longest(u: NDArray[np.int64], v: NDArray[np.int64], mask: Bools) -> Floats:
-    """Return the path (n, 2) between the two places of an area that are farthest apart within it."""
-    depth = distance_transform_edt(mask)[v, u]
-    index = np.full(mask.shape, -1)
+def paths(mask: Bools, factor: int) -> list[Floats]:
+    """Return the paths (n, 2) [px] along the areas of a reduced picture, the longest first."""
+    kernel = np.ones((CLOSED, CLOSED), np.uint8)
+    closed: Any = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, kernel)
+    parts, _ = label(closed, np.ones((3, 3)))
+    depths, found = distance_transform_edt(closed), []
+    for number, part in enumerate(find_objects(parts), 1):
+        v, u = np.nonzero(parts[part] == number)
+        if len(v) >= LEAST_PATH:
+            found.append(_longest(u + part[1].start, v + part[0].start, depths) * factor)
+    return sorted((path for path in found if len(path) >= LEAST_PATH), key=len, reverse=True)
+
+
+def _longest(u: NDArray[np.int64], v: NDArray[np.int64], depths: Floats) -> Floats:
+    """Return the path between the two places of an area that are farthest apart within it."""
+    depth = depths[v, u]
+    index = np.full(depths.shape, -1)
     index[v, u] = np.arange(len(u))
     rows, columns, costs = [], [], []
-    height, width = mask.shape
+    height, width = depths.shape
     for x, y in ((1, 0), (0, 1), (1, 1), (-1, 1)):
         inside = (u + x >= 0) & (u + x < width) & (v + y < height)
         other = index[(v + y)[inside], (u + x)[inside]]
@@ -103,17 +115,68 @@ def _longest(u: NDArray[np.int64], v: NDArray[np.int64], mask: Bools) -> Floats:
     return np.column_stack([u[path], v[path]]).astype(float)
 
 
-def bridge(image: DloImage, before: Floats, after: Floats, length: float) -> Floats | None:
-    """Return the smooth curve (n, 2) [px] of a length from one line to another; None: none has it."""
-    share = np.linspace(0.0, 1.0, 22)[1:-1]
-    gap = float(np.linalg.norm(after[0] - before[-1]))
-    ways = [directions(part[[0, -1]])[0] for part in (before, after)]
-    low, high = 0.0, 3.0
-    for _ in range(20):
+@dataclass(frozen=True, eq=False)
+class Joined:
+    """
+    A line along parts, and the curves between them.
+
+    :param line: (n, d).
+    :param curves: (m, d), all together.
+    :param turn: by which these curves turn [rad].
+    """
+
+    line: Floats
+    curves: Floats
+    turn: float
+
+
+def joined(parts: Sequence[Floats], length: float, whole: bool) -> list[Joined]:
+    """
+    Return the lines along parts, with smooth curves between them, that which turns least first.
+
+    :param parts: (k, d) each, in any order and direction; more of them take factorially longer.
+    :param length: of the whole line; longer ones, as those that are partly in the air look, come last.
+    :param whole: whether the curves are all that is hidden, or an end may be, too.
+    """
+    hidden = max(length - sum(float(arc_lengths(part)[-1]) for part in parts), 0.0)
+    found = []
+    for order in permutations(range(len(parts))):
+        for signs in product((1, -1), repeat=len(parts)):
+            row = [parts[k][::sign] for k, sign in zip(order, signs, strict=True)]
+            curves = _curves(row, hidden, LONGER * length, whole) if order[0] <= order[-1] else None
+            if curves is not None:
+                between = [curve[1:-1] for curve in curves] + [row[0][:0]]
+                line = np.concatenate([piece for pair in zip(row, between, strict=True) for piece in pair])
+                found.append(Joined(line, np.concatenate(between), sum(map(_turn, curves))))
+    return sorted(found, key=lambda one: (arc_lengths(one.line)[-1] > (1 + WRONG_LENGTH) * length, one.turn))
+
+
+def _curves(row: Sequence[Floats], length: float, longer: float, exactly: bool) -> list[Floats] | None:
+    """Return the curves (n, d) between parts in a row, which have a length together, or are longer."""
+    gaps = [float(np.linalg.norm(after[0] - before[-1])) for before, after in pairwise(row)]
+    if sum(gaps) > length + longer:
+        return None
+    if not exactly or not gaps or sum(gaps) > length:
+        return [_curve(*pair, 1.0) for pair in pairwise(row)]
+    low, high = 0.0, LONGEST_CURVE
+    for _ in range(12):
         middle = (low + high) / 2
-        slopes = [middle * gap * way for way in ways]
-        curve = CubicHermiteSpline((0.0, 1.0), (before[-1], after[0]), slopes)(share)
-        whole = np.concatenate([before[-1:], curve, after[:1]])
-        excess = float(image.arc_lengths(whole)[-1]) / max(length, 1e-9) - 1
+        curves = [_curve(*pair, middle) for pair in pairwise(row)]
+        excess = sum(float(arc_lengths(curve)[-1]) for curve in curves) - length
         low, high = (middle, high) if excess < 0 else (low, middle)
-    return np.asarray(curve) if abs(excess) < WRONG_LENGTH else None
+    return curves if abs(excess) < WRONG_LENGTH * length else None
+
+
+def _curve(before: Floats, after: Floats, slope: float) -> Floats:
+    """Return a smooth curve (n, d) from the end of one line to the beginning of another one."""
+    gap = float(np.linalg.norm(after[0] - before[-1]))
+    slopes = [slope * gap * directions(part[[0, -1]])[0] for part in (before[-TANGENT:], after[:TANGENT])]
+    return np.asarray(CubicHermiteSpline((0.0, 1.0), (before[-1], after[0]), slopes)(PLACES))
+
+
+def _turn(curve: Floats) -> float:
+    """Return the angle by which a curve (n, d) turns [rad]."""
+    steps = np.diff(curve, axis=0)
+    sizes = np.linalg.norm(steps, axis=1)
+    cosines = (steps[1:] * steps[:-1]).sum(axis=1) / np.maximum(sizes[1:] * sizes[:-1], 1e-12)
+    return float(np.arccos(np.clip(cosines, -1.0, 1.0)).sum())

@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter1d
+from scipy.spatial import cKDTree
 
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.vision.appearance import Appearance, Bools
@@ -27,12 +28,14 @@ from dlo_calibration.vision.followed_line import FAR, followed
 from dlo_calibration.vision.ground import Ground
 from dlo_calibration.vision.lift import Lift
 from dlo_calibration.vision.line_search import (
-    bridge,
+    area,
     coloured,
-    elsewhere,
-    largest_path,
+    joined,
+    LONGER,
+    paths,
     REDUCED,
     reduction,
+    shown_places,
     WRONG_LENGTH,
 )
 from dlo_calibration.vision.middle_line import along_line, arc_lengths, evenly
@@ -55,8 +58,8 @@ SHEET_ALIKE = 0.1  # share of a part of the sheet that has the DLO's colour, fro
 SEARCHES = 10  # images from one search of the whole picture to the next
 ELSEWHERE = 'the DLO is also where the line is not: move it slowly, or start again with new clicks'
 NO_END = "neither end is seen, and the sheet has the DLO's colour: lay it where the DLO does not come"
-WHOLE = 0.8  # share of a line that must be seen where all of it was searched
-BRIDGED = 6  # points that tell the direction of a line where it is hidden
+COVERED = 0.7  # share of the curves between parts of the DLO where something covers the ground, at least
+PARTS = 4  # of the DLO between what hides it, at most, from which the line is assembled
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,14 +116,16 @@ class Tracker:
         self._line = TrackedLine(line, sure, (True, True), 0.0, Lift.of(line, np.zeros(2)))
         self._velocity: Floats = np.zeros_like(line)
         self._lost_for = 0
+        self._assembled = False  # of parts, whose ends have not been seen since
         self._shown = 1.0
         self._ground = Ground(pixels, scale, line, self._dlo.halves(line, scale))
         self._hide = self._alike(DloImage(pixels, scale, self._dlo, self._ground))
         image = self._image(pixels)
-        _, free, own = elsewhere(image, line, self._shown)
+        factor = reduction(image.width(line))
+        own, others = (area(mask, factor) for mask in shown_places(image, line, self._shown))
         # Where it is thin or blurred, less than its area has its colour.
         self._shown = max(own / self._area(image, line), SHOWN)
-        self._usual = free / self._area(image, line)
+        self._usual = others / self._area(image, line)
         return self._tracked(image)
 
     def next(self, pixels: Pixels, elapsed: float, scale: Scale | None = None) -> Tracked:
@@ -135,26 +140,25 @@ class Tracker:
         image, before = self._image(pixels), self._line
         found = followed(image, before, before.line + self._velocity * elapsed,
                          WIDER if self._lost_for else FAR[0])
-        reason = self._doubt(image, found)
-        if reason:
-            again = self._rejoined(image, found) if reason == ELSEWHERE else None
-            if again is None and self._lost_for % SEARCHES == SEARCHES - 1:
-                again = self._searched(image)
-            if again is not None:
-                found, reason = again, ''
-        if reason:
+        reason, again = self._doubt(image, found), None
+        if reason == ELSEWHERE or reason and self._lost_for % SEARCHES == SEARCHES - 1:
+            again = self._again(image, found)
+        if again is not None:
+            found, self._assembled = again, True
+        elif reason:
             self._lost_for += 1
             self._velocity = np.zeros_like(before.line)
             if reason in (ELSEWHERE, NO_END):  # from there, it may reach the rest in the next image
                 self._line = found
             return Tracked(np.full((self._count, 2), np.nan), image.width(self._line.line), reason)
-        if self._lost_for or elapsed <= 0:
+        if again is not None or self._lost_for or elapsed <= 0:
             self._velocity = np.zeros_like(before.line)
         else:
             change = (found.line - before.line) / elapsed
             self._velocity = DAMPED * gaussian_filter1d(change, 2.0, axis=0)
         self._lost_for = 0
         self._line = found
+        self._assembled &= not all(found.ends)
         return self._tracked(image)
 
     def _rescale(self, scale: Scale | None) -> None:
@@ -196,7 +200,12 @@ class Tracker:
         place = np.linspace(0, len(self._line.line) - 1, self._count)
         points = along_line(self._line.line, np.arange(float(len(self._line.line))), place)
         low, high = np.floor(place).astype(int), np.ceil(place).astype(int)
-        points[~(self._line.seen[low] & self._line.seen[high])] = np.nan
+        seen = self._line.seen
+        if self._assembled:  # how much of the DLO is hidden is not known: only what a visible end is part of
+            hidden = np.cumsum(~seen[4:-4])
+            hidden = np.concatenate([[0] * 4, hidden, [hidden[-1]] * 4])
+            seen = seen & (self._line.ends[0] & (hidden == 0) | self._line.ends[1] & (hidden == hidden[-1]))
+        points[~(seen[low] & seen[high])] = np.nan
         return Tracked(points, image.width(self._line.line))
 
     def _area(self, image: DloImage, line: Floats) -> float:
@@ -213,7 +222,8 @@ class Tracker:
             return 'too little of the DLO is seen: take hands out of the way, and move it slowly'
         if self._hide.any() and not any(found.ends):
             return NO_END
-        unexplained = elsewhere(image, found.line, self._shown)[1] / self._area(image, found.line)
+        _, others = shown_places(image, found.line, self._shown)
+        unexplained = area(others, reduction(image.width(found.line))) / self._area(image, found.line)
         least = LEAST_PART * image.width(found.line) / float(arc_lengths(found.line)[-1])
         if unexplained > self._usual + max(UNEXPLAINED, least):
             return ELSEWHERE
@@ -221,32 +231,33 @@ class Tracker:
         self._usual += ADAPTED * (unexplained - self._usual)
         return ''
 
-    def _searched(self, image: DloImage) -> TrackedLine | None:
-        """Return the line found anywhere in the picture; None: there is none that is sure."""
-        width, line = image.width(self._line.line), self._line.line
-        path = largest_path(coloured(image, width), reduction(width))
-        if path is None:
-            return None
-        same, turned = (np.linalg.norm(ends - line[[0, -1]], axis=1).sum()
-                        for ends in (path[[0, -1]], path[[-1, 0]]))
-        return self._checked(image, path[::-1] if same > turned else path, whole=True)
+    def _again(self, image: DloImage, found: TrackedLine) -> TrackedLine | None:
+        """Return the line along all parts of the DLO that the picture shows; None: it is not sure."""
+        own, others = shown_places(image, found.line, self._shown)
+        width = image.width(found.line)
+        parts = [part for part in map(image.flat, paths(own | others, reduction(width)))
+                 if np.isfinite(part).all()][:PARTS]
+        if not parts or len(parts) > 1 and not any(found.ends):
+            return None  # nothing says in which order they are
+        for one in joined(parts, self._dlo.length, all(found.ends)):
+            for order in (1, -1):
+                line, curves = (points if image.scale is None else image.scale.to_pixels(points)
+                                for points in (one.line[::order], one.curves))
+                fits = self._agrees(line, found, width)
+                if fits and (not len(curves) or image.hides(curves).mean() > COVERED):
+                    return self._checked(image, line, whole=len(parts) == 1)
+        return None
 
-    def _rejoined(self, image: DloImage, found: TrackedLine) -> TrackedLine | None:
-        """Return the line that goes on where its rest comes out of what hides it; None: none is sure."""
-        path = largest_path(elsewhere(image, found.line, self._shown)[0], reduction(image.width(found.line)))
-        if path is None or all(found.ends):
-            return None
-        order = -1 if found.ends[1] else 1
-        line = found.line[::order]
-        line = line[:np.flatnonzero(found.seen[::order])[-1] + 1]
-        # The DLO ends where the path is farther away.
-        if np.linalg.norm(path[0] - line[-1]) > np.linalg.norm(path[-1] - line[-1]):
-            path = path[::-1]
-        rest = self._dlo.length - float(image.arc_lengths(line)[-1] + image.arc_lengths(path)[-1])
-        between = bridge(image, line[-BRIDGED:], path[:BRIDGED], rest)
-        if between is None:
-            return None
-        return self._checked(image, np.concatenate([line, between, path])[::order], whole=False)
+    def _agrees(self, line: Floats, found: TrackedLine, width: float) -> bool:
+        """Tell whether a line (n, 2) [px] has the ends that are seen, and runs as what is seen of another."""
+        apart = np.linalg.norm(line[[0, -1]] - found.line[[0, -1]], axis=1)
+        if any(found.ends):
+            return bool((apart < 2 * width)[np.array(found.ends)].all())
+        distances, nearest = cKDTree(line).query(found.line)
+        known = np.flatnonzero(found.seen & (distances < width))
+        if len(known) > 1 and np.ptp(nearest[known]):
+            return bool(np.polyfit(known, nearest[known], 1)[0] > 0)
+        return bool(apart.sum() < np.linalg.norm(line[[-1, 0]] - found.line[[0, -1]], axis=1).sum())
 
     def _checked(self, image: DloImage, rough: Floats, whole: bool) -> TrackedLine | None:
         """Return the line near a rough one (n, 2) [px], from end to end if whole; None: it is not sure."""
@@ -254,14 +265,11 @@ class Tracker:
                                    mode='nearest')
         count = len(self._line.line)
         arc = image.arc_lengths(smooth)
-        if not abs(arc[-1] / self._dlo.length - 1) < 2 * WRONG_LENGTH:
+        if not arc[-1] > (1 - (1 if whole else 2) * WRONG_LENGTH) * self._dlo.length:
             return None
         line = along_line(smooth, arc, np.linspace(0, arc[-1], count))
         rests = TrackedLine(line, np.ones(count, bool), (True, True), 0.0,
                             Lift.of(line, np.full(2, np.nan)))
         found = followed(image, rests, line, FAR[1])
-        if whole:
-            sure = all(found.ends) and found.seen.mean() >= WHOLE
-        else:  # where a hand holds an end, how long the rest of the DLO looks is not known
-            sure = all(found.ends) or any(found.ends) and found.lift.held is None
-        return found if sure and abs(found.excess) < WRONG_LENGTH and not self._doubt(image, found) else None
+        sure = (all if whole else any)(found.ends) and -WRONG_LENGTH < found.excess < LONGER
+        return found if sure and not self._doubt(image, found) else None

@@ -254,6 +254,22 @@ def test_a_line_that_has_come_off_the_end_finds_back():
     assert np.isfinite(found[-1].pixels[1:-1]).all()
 
 
+def test_a_line_that_has_come_off_while_a_hand_hides_the_middle_finds_back():
+    curve = bent(0.9)
+    renderer().restart(0)
+    shown, partly = (renderer().image([Instant(CAMERA, curve, hands)])
+                     for hands in ((), (Hand((0.25, float(curve[200, 1]) + 0.05)),)))
+    tracker, scale = Tracker(COUNT), scale_of(CAMERA)
+    tracker.start(shown, CAMERA.project(points_of(curve)[::5]), scale)
+    line = np.array(tracker._line.line)
+    line[:40] = line[40] + (line[:40] - line[40]) @ np.array([[0.3, 0.9], [-0.9, 0.3]])  # turned aside
+    tracker._line = replace(tracker._line, line=line)
+    for _ in range(4):
+        off = errors(tracker.next(partly, STEP, scale), curve)
+        assert np.nanmax(off) < FAR
+        assert np.isfinite(off[1:9]).all() and np.isfinite(off[16:-1]).all()
+
+
 @pytest.mark.long
 def test_blur_is_no_obstacle():
     curves = moving(8)
