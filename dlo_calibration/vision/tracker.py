@@ -59,6 +59,7 @@ SEARCHES = 10  # images from one search of the whole picture to the next
 ELSEWHERE = 'the DLO is also where the line is not: move it slowly, or start again with new clicks'
 NO_END = "neither end is seen, and the sheet has the DLO's colour: lay it where the DLO does not come"
 COVERED = 0.7  # share of the curves between parts of the DLO where something covers the ground, at least
+TIP = 4  # stations at an end that may not be seen, though the end is
 PARTS = 4  # of the DLO between what hides it, at most, from which the line is assembled
 
 
@@ -201,10 +202,11 @@ class Tracker:
         points = along_line(self._line.line, np.arange(float(len(self._line.line))), place)
         low, high = np.floor(place).astype(int), np.ceil(place).astype(int)
         seen = self._line.seen
-        if self._assembled:  # how much of the DLO is hidden is not known: only what a visible end is part of
-            hidden = np.cumsum(~seen[4:-4])
-            hidden = np.concatenate([[0] * 4, hidden, [hidden[-1]] * 4])
-            seen = seen & (self._line.ends[0] & (hidden == 0) | self._line.ends[1] & (hidden == hidden[-1]))
+        if self._assembled:
+            # How much of the DLO is hidden is not known: only what a visible end is part of counts.
+            inner = np.r_[np.full(TIP, True), seen[TIP:-TIP], np.full(TIP, True)]
+            hidden, ends = np.cumsum(~inner), self._line.ends
+            seen = seen & (ends[0] & (hidden == 0) | ends[1] & (hidden == hidden[-1]))
         points[~(seen[low] & seen[high])] = np.nan
         return Tracked(points, image.width(self._line.line))
 

@@ -254,20 +254,40 @@ def test_a_line_that_has_come_off_the_end_finds_back():
     assert np.isfinite(found[-1].pixels[1:-1]).all()
 
 
-def test_a_line_that_has_come_off_while_a_hand_hides_the_middle_finds_back():
-    curve = bent(0.9)
-    renderer().restart(0)
-    shown, partly = (renderer().image([Instant(CAMERA, curve, hands)])
-                     for hands in ((), (Hand((0.25, float(curve[200, 1]) + 0.05)),)))
-    tracker, scale = Tracker(COUNT), scale_of(CAMERA)
-    tracker.start(shown, CAMERA.project(points_of(curve)[::5]), scale)
+def come_off(curve, scale):
+    """Return a tracker whose line has come off the first third of a DLO."""
+    tracker = Tracker(COUNT)
+    tracker.start(renderer().image([Instant(CAMERA, curve)]), CAMERA.project(points_of(curve)[::5]), scale)
     line = np.array(tracker._line.line)
     line[:40] = line[40] + (line[:40] - line[40]) @ np.array([[0.3, 0.9], [-0.9, 0.3]])  # turned aside
     tracker._line = replace(tracker._line, line=line)
+    return tracker
+
+
+def test_a_line_that_has_come_off_while_a_hand_hides_the_middle_finds_back():
+    curve, scale = bent(0.9), scale_of(CAMERA)
+    renderer().restart(0)
+    tracker, middle = come_off(curve, scale), Hand((0.25, float(curve[200, 1]) + 0.05))
+    pixels = renderer().image([Instant(CAMERA, curve, (middle,))])
     for _ in range(4):
-        off = errors(tracker.next(partly, STEP, scale), curve)
+        off = errors(tracker.next(pixels, STEP, scale), curve)
         assert np.nanmax(off) < FAR
         assert np.isfinite(off[1:9]).all() and np.isfinite(off[16:-1]).all()
+
+
+@pytest.mark.long
+def test_beyond_a_hidden_part_a_line_that_was_assembled_counts_only_once_its_end_is_seen():
+    curve, scale = bent(0.9), scale_of(CAMERA)
+    renderer().restart(0)
+    tracker = come_off(curve, scale)
+    middle, end = Hand((0.25, float(curve[200, 1]) + 0.05)), Hand((0.01, 0.02), -2.2)
+    for hands, both in (((middle, end), False), ((middle,), True)):
+        pixels = renderer().image([Instant(CAMERA, curve, hands)])
+        for _ in range(6):
+            off = errors(tracker.next(pixels, STEP, scale), curve)
+        assert np.isfinite(off[16:-1]).all()
+        assert np.nanmax(off) < FAR
+        assert np.isfinite(off[3:9]).all() if both else np.isnan(off[:9]).all()
 
 
 @pytest.mark.long
