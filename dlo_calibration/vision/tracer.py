@@ -26,7 +26,7 @@ CLICK = 80.0  # px in a photograph of 4000 px: how far beside the DLO a click ma
 APART = 0.4  # of the distance to the next click: beyond, it could stand for another place of the DLO
 SPACING = 3.0  # px between the points of a trace, in a photograph of 4000 px
 SEEN = 0.3  # share of the line that must be sure, else there is no DLO
-UNSURE_END = 1.5  # widths that are not sure at an end: then the line is looked for again
+UNSURE_END = 1.5  # widths that are not sure at an end, or to its click: the line is looked for again
 ABOVE = 1.35  # least ratio of the upper strand's edge strength to the lower one's
 LINE, UNSURE, POINTS = (0, 220, 255), (255, 60, 0), (255, 255, 0)  # red, green, blue
 OUTLINE = (0, 0, 0)
@@ -90,27 +90,31 @@ class Tracer:
             DLO along them.
         """
         places = self._checked(clicks)
-        trace, table = self._along(self._levels, places, clamped)
-        if _unsure_end(trace):
+        first = self._along(self._levels, places, clamped)
+        if first is None:
+            raise _no_dlo()
+        trace, table = first
+        if _unsure_end(trace, places):
             # Something else led the line astray, say the edge of a sheet: its colours are not the DLO's.
             looks = odds(table, self._levels[0].lab)
-            again, _ = self._along([level.of(looks) for level in self._levels], places, clamped)
-            trace = max(trace, again, key=lambda one: one.sure.mean())
+            again = self._along([level.of(looks) for level in self._levels], places, clamped)
+            if again is not None and _sure_length(again[0]) > _sure_length(trace) + trace.width:
+                return again[0]
         return trace
 
-    def _along(self, reduced: list[Level], places: Floats, clamped: bool) -> tuple[Trace, Singles]:
+    def _along(self, reduced: list[Level], places: Floats, clamped: bool) -> tuple[Trace, Singles] | None:
         """Return the trace along clicks (k, 2), and the table of the DLO's colours, as `odds` reads it."""
         scale = max(self._pixels.shape[:2]) / 4000
         ridge = learn(reduced, places)
         rough = ridge_path(ridge, places, _reaches(places, scale))
         if len(rough) < 2:
-            raise _no_dlo()
+            return None
         near = max(NEAR_END * scale, 2 * ridge.width)
         middle = fit(self._pixels, rough, ridge.width, near)
         line, sure, strength = between_ends(self._pixels, middle, places, NEAR_END * scale,
                                             max(SPACING * scale, 1.0), clamped)
         if len(line) < 3 or sure.mean() < SEEN:
-            raise _no_dlo()
+            return None
         size = 2 * float(np.median(middle.half))
         return Trace(frozen_array(line), frozen_array(sure, bool), size,
                      tuple(_crossings(line, strength, size))), middle.table
@@ -134,11 +138,16 @@ class Tracer:
         return np.asarray(np.clip(places[distinct], 0, (width - 1, height - 1)))
 
 
-def _unsure_end(trace: Trace) -> bool:
-    """Tell whether the first or last part of a line is not sure."""
+def _unsure_end(trace: Trace, clicks: Floats) -> bool:
+    """Tell whether the first or last part of a line is not sure, or its end is not at the click (k, 2)."""
     least = UNSURE_END * trace.width
     arc = arc_lengths(trace.pixels)
-    return not (trace.sure[arc < least].any() and trace.sure[arc > arc[-1] - least].any())
+    sure = trace.sure[arc < least].any() and trace.sure[arc > arc[-1] - least].any()
+    return not sure or bool((np.linalg.norm(trace.pixels[[0, -1]] - clicks[[0, -1]], axis=1) > least).any())
+
+
+def _sure_length(trace: Trace) -> float:
+    return float(trace.sure.mean() * arc_lengths(trace.pixels)[-1])
 
 
 def _reaches(clicks: Floats, scale: float) -> Floats:
