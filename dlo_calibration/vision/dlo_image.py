@@ -66,8 +66,8 @@ class DloImage:
             found &= ~self.covered[v, u]
         return found
 
-    def hides(self, points: Floats) -> Bools:
-        """Tell at which points (n, 2) [px] something covers the ground, or the picture does not show it."""
+    def hidden(self, points: Floats) -> Bools:
+        """Tell at which points (n, 2) [px] something hides the ground, or the picture does not show it."""
         lab = colours_at(self.pixels, points[:, None])
         strange = self.ground.differences(lab, points[:, None], self.scale, self.dlo.colours)
         return np.asarray((strange > OTHER) | ~self.inside(points, 0.0))

@@ -71,7 +71,7 @@ class Level:
         inverse: Floats = np.linalg.inv(covariance).astype(float)
         return cls(factor, lab, curvature, inverse)
 
-    def of(self, looks: Singles) -> Level:
+    def showing(self, looks: Singles) -> Level:
         """Return the same level of how much each pixel (h, w) of the finest one looks like the DLO."""
         lab = np.zeros_like(self.lab)
         lab[..., 0] = cv2.resize(LIGHTNESS * looks, lab.shape[1::-1], interpolation=cv2.INTER_AREA)

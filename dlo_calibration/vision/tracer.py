@@ -97,7 +97,7 @@ class Tracer:
         if _unsure_end(trace, places):
             # Something else led the line astray, say the edge of a sheet: its colours are not the DLO's.
             looks = odds(table, self._levels[0].lab)
-            again = self._along([level.of(looks) for level in self._levels], places, clamped)
+            again = self._along([level.showing(looks) for level in self._levels], places, clamped)
             if again is not None and _sure_length(again[0]) > _sure_length(trace) + trace.width:
                 return again[0]
         return trace

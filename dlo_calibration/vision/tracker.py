@@ -7,7 +7,8 @@ Tracker: follows a DLO from image to image.
 The tracer finds the line in the first image, where its `appearance` is learned.  In each further image the
 line is near where it is expected (`followed_line`).  It ends where the DLO does (`line_end`), keeps its
 length, and bridges what is hidden (`elastic_line`).  A line that explains too little, or leaves too much
-unexplained, is lost, unless the whole picture shows where it goes on (`line_search`).
+unexplained, is lost, unless the parts that the whole picture shows (`line_search`) can be joined
+(`joined_line`).
 """
 
 from __future__ import annotations
@@ -26,18 +27,9 @@ from dlo_calibration.vision.dlo_image import DloImage
 from dlo_calibration.vision.elastic_line import TrackedLine
 from dlo_calibration.vision.followed_line import FAR, followed
 from dlo_calibration.vision.ground import Ground
+from dlo_calibration.vision.joined_line import joined, LONGER, WRONG_LENGTH
 from dlo_calibration.vision.lift import Lift
-from dlo_calibration.vision.line_search import (
-    area,
-    coloured,
-    joined,
-    LONGER,
-    paths,
-    REDUCED,
-    reduction,
-    shown_places,
-    WRONG_LENGTH,
-)
+from dlo_calibration.vision.line_search import area, coloured, paths, REDUCED, reduction, shown_places
 from dlo_calibration.vision.middle_line import along_line, arc_lengths, evenly
 from dlo_calibration.vision.photograph import Pixels
 from dlo_calibration.vision.scale import Scale
@@ -246,7 +238,7 @@ class Tracker:
                 line, curves = (points if image.scale is None else image.scale.to_pixels(points)
                                 for points in (one.line[::order], one.curves))
                 fits = self._agrees(line, found, width)
-                if fits and (not len(curves) or image.hides(curves).mean() > COVERED):
+                if fits and (not len(curves) or image.hidden(curves).mean() > COVERED):
                     return self._checked(image, line, whole=len(parts) == 1)
         return None
 

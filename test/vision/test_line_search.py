@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from dlo_calibration.vision.line_search import joined, paths
+from dlo_calibration.vision.joined_line import joined
+from dlo_calibration.vision.line_search import paths
 from dlo_calibration.vision.middle_line import arc_lengths
 
 ARC = np.linspace(0.0, 2.2, 221)
