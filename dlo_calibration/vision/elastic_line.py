@@ -91,14 +91,16 @@ def elastic_line(image: DloImage, before: TrackedLine, shown: Shown) -> TrackedL
     if (covered[most] > STRANGE > covered[1 - most]
             or not all(accepted) and lift.strange[most] > STRANGE_ALONE):
         accepted[most] = False
-    if min(covered) > STRANGE:  # a hand covers both
+    # A hand covers both ends; it does not look strange in each image.
+    if np.maximum(covered, lift.strange).min() > STRANGE:
         accepted[:] = False
     if all(accepted):
         line = fit.through(accepted)
         excess = fit.excess(line)
         lift = lift.seen(line, fit.places, ~fit.hidden, MOVES * shown.half)
         # An end that a hand holds may be in the air.
-        fits = excess >= -fit.tolerance if lift.held is None else abs(excess) <= fit.tolerance / 4
+        most_off = fit.tolerance / (4 if lift.shows_hand else 1)
+        fits = excess >= -fit.tolerance if lift.held is None else abs(excess) <= most_off
         if lift.raises or fits:
             return fit.between_ends(line, excess, lift)
         # What covers an end makes the DLO look shorter, as does an end that is held in the air; both move.

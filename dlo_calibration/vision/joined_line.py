@@ -19,7 +19,7 @@ from dlo_calibration.vision.middle_line import arc_lengths
 TANGENT = 6  # points that tell the direction of a path where it is hidden
 PLACES = np.linspace(0.0, 1.0, 22)  # on a curve between two paths
 LONGEST_CURVE = 3.0  # slope at both ends of that curve, to its ends' distance
-LONGER = 0.15  # of the length, by which a DLO in the air may look longer
+IN_AIR = 0.15  # share of the length by which a DLO may look longer in the air, or shorter under a hand
 WRONG_LENGTH = 0.05  # share of the length by which a line that is found again may differ
 
 
@@ -51,7 +51,7 @@ def joined(parts: Sequence[Floats], length: float, whole: bool) -> list[Joined]:
     for order in permutations(range(len(parts))):
         for signs in product((1, -1), repeat=len(parts)):
             row = [parts[k][::sign] for k, sign in zip(order, signs, strict=True)]
-            curves = _curves(row, hidden, LONGER * length, whole) if order[0] <= order[-1] else None
+            curves = _curves(row, hidden, IN_AIR * length, whole) if order[0] <= order[-1] else None
             if curves is not None:
                 between = [curve[1:-1] for curve in curves] + [row[0][:0]]
                 line = np.concatenate([piece for pair in zip(row, between, strict=True) for piece in pair])

@@ -35,6 +35,7 @@ class Lift:
     :param rested: (n, 2) the line when last all of it lay on the table [px].
     :param strange: (2,) distance in L, a, b of what is behind an end from the ground, as a mean over images;
         not a number: no image has shown it yet.
+    :param held: the end, 0 or 1, that a hand last seemed to hold since then; None: neither.
     :param ends: (2,) how far the ends have been from where they rested [px].
     :param middle: how far a part that was hidden has been [px].
     :param raises: whether a hand seems to lift the middle, and not an end.
@@ -43,6 +44,7 @@ class Lift:
 
     rested: Floats
     strange: Floats
+    held: int | None
     ends: Floats
     middle: float
     raises: bool
@@ -51,18 +53,19 @@ class Lift:
     @classmethod
     def of(cls, line: Floats, strange: Floats) -> Lift:
         """Return the state of a line that lies on the table: nothing is lifted."""
-        return cls(line, strange, np.zeros(2), 0.0, False, (len(line) - 1) / 2)
+        return cls(line, strange, None, np.zeros(2), 0.0, False, (len(line) - 1) / 2)
 
     @property
-    def held(self) -> int | None:
-        """The end that a hand seems to hold, 0 or 1: it is stranger than the other one; None: neither."""
-        return int(np.argmax(self.strange)) if abs(self.strange[0] - self.strange[1]) > HELD else None
+    def shows_hand(self) -> bool:
+        """Whether it is stranger behind one end than behind the other, as where a hand holds it."""
+        return bool(abs(self.strange[0] - self.strange[1]) > HELD)
 
     def behind(self, strange: Sequence[float | None]) -> Lift:
         """Return the state with what an image shows behind both ends; None: it does not show that end."""
         means = [mean if new is None else new if np.isnan(mean) else mean + NEWEST * (new - mean)
                  for new, mean in zip(strange, self.strange.tolist(), strict=True)]
-        return replace(self, strange=np.array(means))
+        now = replace(self, strange=np.array(means))
+        return replace(now, held=int(np.argmax(means))) if now.shows_hand else now
 
     def seen(self, line: Floats, ends: Floats, shown: Bools, least: float) -> Lift:
         """

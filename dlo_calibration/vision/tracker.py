@@ -24,10 +24,11 @@ from scipy.spatial import cKDTree
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.vision.appearance import Appearance, Bools
 from dlo_calibration.vision.dlo_image import DloImage
+from dlo_calibration.vision.elastic import directions
 from dlo_calibration.vision.elastic_line import TrackedLine
 from dlo_calibration.vision.followed_line import FAR, followed
 from dlo_calibration.vision.ground import Ground
-from dlo_calibration.vision.joined_line import joined, LONGER, WRONG_LENGTH
+from dlo_calibration.vision.joined_line import IN_AIR, joined, WRONG_LENGTH
 from dlo_calibration.vision.lift import Lift
 from dlo_calibration.vision.line_search import area, coloured, paths, REDUCED, reduction, shown_places
 from dlo_calibration.vision.middle_line import along_line, arc_lengths, evenly
@@ -49,7 +50,6 @@ DAMPED = 0.7  # of the velocity that remains
 SHEET_ALIKE = 0.1  # share of a part of the sheet that has the DLO's colour, from which on it hides the DLO
 SEARCHES = 10  # images from one search of the whole picture to the next
 ELSEWHERE = 'the DLO is also where the line is not: move it slowly, or start again with new clicks'
-NO_END = "neither end is seen, and the sheet has the DLO's colour: lay it where the DLO does not come"
 COVERED = 0.7  # share of the curves between parts of the DLO where something covers the ground, at least
 TIP = 4  # stations at an end that may not be seen, though the end is
 PARTS = 4  # of the DLO between what hides it, at most, from which the line is assembled
@@ -141,13 +141,16 @@ class Tracker:
         elif reason:
             self._lost_for += 1
             self._velocity = np.zeros_like(before.line)
-            if reason in (ELSEWHERE, NO_END):  # from there, it may reach the rest in the next image
+            if reason == ELSEWHERE:  # from there, it may reach the rest in the next image
                 self._line = found
             return Tracked(np.full((self._count, 2), np.nan), image.width(self._line.line), reason)
         if again is not None or self._lost_for or elapsed <= 0:
             self._velocity = np.zeros_like(before.line)
         else:
             change = (found.line - before.line) / elapsed
+            if not any(found.ends):  # how it slides along itself is not seen
+                tangents = directions(found.line)
+                change -= (change * tangents).sum(axis=1, keepdims=True) * tangents
             self._velocity = DAMPED * gaussian_filter1d(change, 2.0, axis=0)
         self._lost_for = 0
         self._line = found
@@ -214,8 +217,6 @@ class Tracker:
             return 'the DLO has left the picture, or lies on a sheet of its colour: show it again'
         if found.seen.mean() < LEAST:
             return 'too little of the DLO is seen: take hands out of the way, and move it slowly'
-        if self._hide.any() and not any(found.ends):
-            return NO_END
         _, others = shown_places(image, found.line, self._shown)
         unexplained = area(others, reduction(image.width(found.line))) / self._area(image, found.line)
         least = LEAST_PART * image.width(found.line) / float(arc_lengths(found.line)[-1])
@@ -259,11 +260,11 @@ class Tracker:
                                    mode='nearest')
         count = len(self._line.line)
         arc = image.arc_lengths(smooth)
-        if not arc[-1] > (1 - (1 if whole else 2) * WRONG_LENGTH) * self._dlo.length:
+        if not arc[-1] > (1 - (WRONG_LENGTH if whole else IN_AIR)) * self._dlo.length:
             return None
         line = along_line(smooth, arc, np.linspace(0, arc[-1], count))
         rests = TrackedLine(line, np.ones(count, bool), (True, True), 0.0,
                             Lift.of(line, np.full(2, np.nan)))
         found = followed(image, rests, line, FAR[1])
-        sure = (all if whole else any)(found.ends) and -WRONG_LENGTH < found.excess < LONGER
+        sure = (all if whole else any)(found.ends) and -WRONG_LENGTH < found.excess < IN_AIR
         return found if sure and not self._doubt(image, found) else None
