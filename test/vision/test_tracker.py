@@ -481,3 +481,17 @@ def test_a_finger_beside_a_short_thick_dlo_of_its_colour_is_not_taken_for_it():
     tracker = Tracker(21)
     tracker.start(drawn(0, False), [(62, 120), (160, 120), (258, 120)])
     assert not any(tracker.next(drawn(k, True), STEP).lost for k in range(4))
+
+
+@pytest.mark.long
+def test_between_two_hands_the_line_does_not_go_on_sliding_when_the_dlo_has_stopped():
+    # The hands come while the DLO slides along itself, and cover where it ends.
+    way = np.concatenate([np.linspace(0.0, 0.06, 7), np.full(8, 0.06)])
+    curves = [bent(0.15, (x - 0.06, 0.0)) for x in way]
+    ends = [(curve[[0, -1], :2] + [[0.02, 0.0], [-0.02, 0.0]]).tolist() for curve in curves]
+    hands = [() if k < 6 else tuple(Hand(tuple(end)) for end in ends[k]) for k in range(len(curves))]
+    found = tracked(curves, hands)[-1]
+    assert not found.lost
+    off = errors(found, curves[-1])
+    assert np.isfinite(off[4:-4]).all()
+    assert np.nanmax(off) < 1.5 * FAR
