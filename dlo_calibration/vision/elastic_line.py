@@ -38,7 +38,7 @@ TOLERANCE = 0.006  # share of the length on a table that a line between two visi
 UNSCALED = 0.04  # the same in a picture without a scale
 BLURRED = 3.0  # px that it may lack besides, as ends are blurred
 STRANGE = 16.0  # distance in L, a, b of what is behind an end, from which on it is probably covered
-STRANGE_ALONE = 6.0  # the same, as a mean, where the other end is not seen
+STRANGE_ALONE = 6.0  # the same, as a mean, where the other end is not seen, and no hand seems to hold it
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +89,7 @@ def elastic_line(image: DloImage, before: TrackedLine, shown: Shown) -> TrackedL
     lift = before.lift.behind([None if end is None else end.strange for end in shown.ends])
     most = int(np.argmax(covered))
     if (covered[most] > STRANGE > covered[1 - most]
-            or not all(accepted) and lift.strange[most] > STRANGE_ALONE):
+            or not all(accepted) and lift.held != 1 - most and lift.strange[most] > STRANGE_ALONE):
         accepted[most] = False
     # A hand covers both ends; it does not look strange in each image.
     if np.maximum(covered, lift.strange).min() > STRANGE:
@@ -108,13 +108,14 @@ def elastic_line(image: DloImage, before: TrackedLine, shown: Shown) -> TrackedL
         unsure = int(np.argmax(moved)) if lift.held is None else lift.held
         accepted[unsure] = False
     ends = (bool(accepted[0]), bool(accepted[1]))
+    if not any(ends) and lift.held is not None and shown.ends[1 - lift.held] is None:
+        accepted[1 - lift.held] = True  # no hand hides that end: it goes on as before
     found = replace(before, line=fit.through(accepted), ends=ends, excess=0.0, lift=lift)
-    unsure = int(np.argmin(accepted))
-    if not any(accepted) or lift.held is None:
+    if not any(ends) or lift.held is None:
         return found
     # The DLO does not end before the hand that holds its end.  Where that end is not seen, it looks as long
     # as before.
-    whole, excess = found.line, before.excess
+    unsure, whole, excess = int(np.argmin(accepted)), found.line, before.excess
     if shown.ends[unsure] is not None:
         whole = fit.through(np.full(2, True), LOOSE)
         excess = fit.excess(whole)
@@ -132,7 +133,7 @@ class _Fit:
         self._before, self._shown, self._length = before, shown, image.dlo.length
         self._fineness = image.finenesses(shown.near)
         self._lengths = self._length / (count - 1) * self._fineness
-        self.places = np.array([shown.near[k] if end is None else end.place
+        self.places = np.array([shown.expected[k] if end is None else end.place
                                 for k, end in zip((0, -1), shown.ends, strict=True)])
         stretch = UNSCALED_STRETCH if image.scale is None else STRETCH
         lengths_known = np.full(count - 1, 1.0 / (stretch * float(self._lengths.mean())) ** 2)

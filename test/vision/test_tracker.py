@@ -398,18 +398,25 @@ def test_a_white_dlo_over_a_white_sheet_is_seen_at_black_squares_alone():
     assert (np.floor(over / SQUARE).sum(axis=1) % 2 == 0).all()
 
 
+def raised(curve, height):
+    """Return a DLO whose first end is raised by a height [m]."""
+    share = np.maximum(1 - np.linspace(0.0, 2.5, len(curve)), 0.0) ** 2
+    return curve + height * share[:, None] * [0.0, 0.0, 1.0]
+
+
 @pytest.mark.long
 @pytest.mark.parametrize('column', [2, 3])
 def test_a_white_dlo_that_ends_on_the_white_sheet_is_followed_under_a_hand_on_its_other_end(column):
     curves = [bent(0.4, (0.0, 0.12 - 0.02 * k)) for k in range(14)]
     place = [(column + 0.5) * SQUARE + (PAPERS['a4'].width - COLUMNS * SQUARE) / 2, 4.5 * SQUARE + BOTTOM]
     board = LaidBoard(tuple(curves[-1][-1, :2] - place))
-    last = curves[-1:] * 8
-    hand = (Hand(tuple(curves[-1][0, :2])),)
-    *_, (found, off) = beside_a_sheet(curves + last, [()] * len(curves) + [hand] * len(last), board)
+    curves += curves[-1:] * 4
+    last = [raised(curves[-1], 0.005 * max(k - 4, 0)) for k in range(16)]
+    hands = [(Hand(tuple(curve[0, :2]), height=curve[0, 2] + 0.007),) for curve in last]
+    *_, (found, off) = beside_a_sheet(curves + last, [()] * len(curves) + hands, board)
     assert not found.tracked.lost, found.tracked.reason
-    assert np.isfinite(off[1:16]).all()
-    assert np.nanmax(off) < FAR
+    assert np.isfinite(off[8:16]).all()
+    assert np.nanmax(off[8:]) < FAR
 
 
 def taped(pixels, curve, camera=CAMERA):
