@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""NodeSession: what the sessions of both nodes have in common, and what they need from their node."""
+"""NodeSession: what the sessions of the three nodes have in common, and what they need from their node."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dlo_calibration.errors import DEFECT, DloCalibrationError, InputError, safe
 from dlo_calibration.messages.codec import MessageTypes
 from dlo_calibration.messages.refusals import Refusals
 
-FAILED = 'failed'  # a state of both nodes
+FAILED = 'failed'  # a state of each node
 NO_TEXTS = ['']  # an empty list of texts as a parameter: ROS cannot distinguish it from other empty lists
 Chosen_co = TypeVar('Chosen_co', bound=DeclaredOptions, covariant=True)
 

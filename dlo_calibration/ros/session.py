@@ -49,7 +49,7 @@ from dlo_calibration.ros.advising import Advising
 from dlo_calibration.ros.calibrator_options import CalibratorOptions
 from dlo_calibration.ros.collecting import Collecting
 from dlo_calibration.ros.markers import alike, markers, shown_obstacles
-from dlo_calibration.ros.node_session import NodeInterface, NodeSession, NodeState, refusal_text
+from dlo_calibration.ros.node_session import FAILED, NodeInterface, NodeSession, NodeState, refusal_text
 from dlo_calibration.ros.recorder import Recorder
 from dlo_calibration.ros.resting_place import RestingPlace
 from dlo_calibration.workspace.live_information import Appraised, LiveInformation
@@ -429,7 +429,7 @@ class CalibrationSession(NodeSession[CalibratorOptions]):
             try:
                 self._graph.info(self._start())
             except InputError as error:
-                state.name, state.detail = 'failed', str(error)
+                state.name, state.detail = FAILED, str(error)
                 self.refuse(str(error))
 
     def _stop(self) -> str:

@@ -6,9 +6,9 @@ Tracker: follows a DLO from image to image.
 
 The tracer finds the line in the first image, where its `appearance` is learned.  In each further image the
 line is near where it is expected (`followed_line`).  It ends where the DLO does (`line_end`), keeps its
-length, and bridges what is hidden (`elastic_line`).  A line that explains too little, or leaves too much
-unexplained, is lost, unless the parts that the whole picture shows (`line_search`) can be joined
-(`joined_line`).
+length, bridges what is hidden (`elastic_line`), and goes straight on where a loop closes (`loop`).  A line
+that explains too little, or leaves too much unexplained, is lost, unless the parts that the whole picture
+shows (`line_search`) can be joined (`joined_line`).
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from dlo_calibration.vision.ground import Ground
 from dlo_calibration.vision.joined_line import IN_AIR, joined, WRONG_LENGTH
 from dlo_calibration.vision.lift import Lift
 from dlo_calibration.vision.line_search import area, coloured, paths, REDUCED, reduction, shown_places
+from dlo_calibration.vision.loop import straight_on
 from dlo_calibration.vision.middle_line import along_line, arc_lengths, evenly
 from dlo_calibration.vision.photograph import Pixels
 from dlo_calibration.vision.scale import Scale
@@ -133,6 +134,10 @@ class Tracker:
         image, before = self._image(pixels), self._line
         found = followed(image, before, before.line + self._velocity * elapsed,
                          WIDER if self._lost_for else FAR[0])
+        if np.isfinite(found.line).all():
+            straight = straight_on(found.line, image.width(found.line))
+            if straight is not found.line:
+                found = followed(image, replace(found, line=straight), straight, FAR[1])
         reason, again = self._doubt(image, found), None
         if reason == ELSEWHERE or reason and self._lost_for % SEARCHES == SEARCHES - 1:
             again = self._again(image, found)
