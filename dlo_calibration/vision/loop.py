@@ -15,7 +15,7 @@ from scipy.spatial.distance import cdist
 
 from dlo_calibration.model.chain import Floats
 
-TOUCHES = 2.5  # widths between two strands of a line that turns back where they cross, at most
+TOUCHES = 1.3  # widths between the middles of two strands that cross, at most: no ground is seen between them
 BESIDE = 2.0  # widths from there to where their directions are compared
 SHORTEST = 6.0  # widths along a loop
 LESS = 0.5  # rad by which the line turns less if it follows the loop the other way round
