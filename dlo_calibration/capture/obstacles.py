@@ -14,7 +14,7 @@ from dlo_calibration.capture.measurement import Measurement
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.xml import add, document, new_root
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.report.obstacles import seen_from_above
+from dlo_calibration.report.obstacles import ABOVE, outline
 from dlo_calibration.simulation.scene import NO_TRIANGLES, Obstacle
 from dlo_calibration.vision.scale import Scale
 
@@ -63,7 +63,7 @@ def _placed(entry: ObstacleEntry, scale: Scale | None, name: str) -> PlacedObsta
 
 def lines_around(obstacle: Obstacle) -> list[Floats]:
     """Return the closed lines around its top and its foot, each (n, 3) [m]."""
-    line = seen_from_above(obstacle)[::ON_CIRCLE if obstacle.shape == 'cylinder' else 1]
+    line = outline(obstacle, ABOVE)[::ON_CIRCLE if obstacle.shape == 'cylinder' else 1]
     line = np.concatenate([line, line[:1]])
     return [np.column_stack([line, np.full(len(line), height)]) for height in (2 * obstacle.position[2], 0.0)]
 

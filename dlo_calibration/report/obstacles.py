@@ -26,20 +26,6 @@ CELLS = 40  # along the longest edge of a mesh, of which each keeps one corner
 ABOVE = np.eye(3)[:2]  # the projection seen from above
 
 
-def seen_from_above(obstacle: Obstacle) -> Floats:
-    """Return the outline seen from above, (k, 2) [m] x and y, anticlockwise; of a mesh, its convex hull."""
-    return outline(obstacle, ABOVE)
-
-
-def seen_from_the_side(obstacle: Obstacle, across: Floats) -> Floats:
-    """
-    Return the outline seen from the side, (k, 2) [m], anticlockwise; of a mesh, its convex hull.
-
-    :param across: (3,) horizontal unit vector, the first coordinate in the drawing; the second is z.
-    """
-    return outline(obstacle, np.array([across, [0.0, 0.0, 1.0]]))
-
-
 def outline(obstacle: Obstacle, projection: Floats) -> Floats:
     """Return the outline in a projection, (k, 2) [m], anticlockwise; of a mesh, its convex hull."""
     from scipy.spatial import ConvexHull, QhullError

@@ -14,15 +14,14 @@ from toy_messages import toy_trials
 from dlo_calibration.report.drawing import session_picture
 from dlo_calibration.report.figure import OBSTACLE
 from dlo_calibration.report.obstacles import (
+    ABOVE,
     MOST_TRIANGLES,
     outline,
-    seen_from_above,
-    seen_from_the_side,
     triangles_of,
 )
 from dlo_calibration.simulation.scene import NO_TRIANGLES, Obstacle, read_scene
 
-ALONG_X = np.array([1.0, 0.0, 0.0])
+ASIDE = np.eye(3)[[0, 2]]  # the projection seen along y
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
 
@@ -43,7 +42,7 @@ def area(outline):
 
 
 def test_a_box_that_is_turned_is_a_turned_rectangle(obstacles):
-    seen = seen_from_above(obstacles[0])
+    seen = outline(obstacles[0], ABOVE)
     turn = np.array([[3**0.5, 1.0], [-1.0, 3**0.5]]) / 2  # from x, y to the edges of the box
     assert len(seen) == 4
     assert np.abs((seen - [0.3, 0.0]) @ turn.T) == pytest.approx(np.tile([0.1, 0.2], (4, 1)))
@@ -52,24 +51,24 @@ def test_a_box_that_is_turned_is_a_turned_rectangle(obstacles):
 
 def test_round_shapes_are_circles_from_above_and_as_high_as_they_are_long(obstacles):
     _, sphere, cylinder, capsule, _ = obstacles
-    assert extent(seen_from_above(sphere)) == pytest.approx([-0.05, 0.25, 0.05, 0.35])
-    assert extent(seen_from_the_side(sphere, ALONG_X)) == pytest.approx([-0.05, 0, 0.05, 0.1])
-    assert area(seen_from_above(sphere)) == pytest.approx(np.pi * 0.05**2, rel=0.01)
-    assert area(seen_from_above(cylinder)) == pytest.approx(np.pi * 0.01**2, rel=0.01)
-    assert extent(seen_from_the_side(cylinder, ALONG_X)) == pytest.approx([-0.01, 0, 0.01, 0.2])
-    assert extent(seen_from_above(capsule)) == pytest.approx([0.48, 0.43, 0.52, 0.57])  # it lies along y
-    assert area(seen_from_above(capsule)) == pytest.approx(0.04 * 0.1 + np.pi * 0.02**2, rel=0.01)
+    assert extent(outline(sphere, ABOVE)) == pytest.approx([-0.05, 0.25, 0.05, 0.35])
+    assert extent(outline(sphere, ASIDE)) == pytest.approx([-0.05, 0, 0.05, 0.1])
+    assert area(outline(sphere, ABOVE)) == pytest.approx(np.pi * 0.05**2, rel=0.01)
+    assert area(outline(cylinder, ABOVE)) == pytest.approx(np.pi * 0.01**2, rel=0.01)
+    assert extent(outline(cylinder, ASIDE)) == pytest.approx([-0.01, 0, 0.01, 0.2])
+    assert extent(outline(capsule, ABOVE)) == pytest.approx([0.48, 0.43, 0.52, 0.57])  # it lies along y
+    assert area(outline(capsule, ABOVE)) == pytest.approx(0.04 * 0.1 + np.pi * 0.02**2, rel=0.01)
 
 
 def test_the_outline_of_a_mesh_is_its_hull(obstacles):
-    assert extent(seen_from_above(obstacles[4])) == pytest.approx([-0.3, 0, -0.2, 0.1])
-    assert extent(seen_from_the_side(obstacles[4], ALONG_X)) == pytest.approx([-0.3, 0, -0.2, 0.2])
+    assert extent(outline(obstacles[4], ABOVE)) == pytest.approx([-0.3, 0, -0.2, 0.1])
+    assert extent(outline(obstacles[4], ASIDE)) == pytest.approx([-0.3, 0, -0.2, 0.2])
 
 
 def test_a_flat_mesh_is_a_line_from_the_side():
     flat = Obstacle('mesh', np.ones(3), np.zeros(3), UPRIGHT, 1.0,
                     np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]]], float))
-    assert extent(outline(flat, np.eye(3)[[0, 2]])) == pytest.approx([0, 0, 1, 0])
+    assert extent(outline(flat, ASIDE)) == pytest.approx([0, 0, 1, 0])
 
 
 def test_a_fine_mesh_is_shown_with_fewer_triangles_of_the_same_shape():
