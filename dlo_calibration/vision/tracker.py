@@ -118,8 +118,8 @@ class Tracker:
         factor = reduction(image.width(line))
         own, others = (area(mask, factor) for mask in shown_places(image, line, self._shown))
         # Where it is thin or blurred, less than its area has its colour.
-        self._shown = max(own / self._area(image, line), SHOWN)
-        self._usual = others / self._area(image, line)
+        self._shown = max(own / self._expected_area(image, line), SHOWN)
+        self._usual = others / self._expected_area(image, line)
         return self._tracked(image)
 
     def next(self, pixels: Pixels, elapsed: float, scale: Scale | None = None) -> Tracked:
@@ -210,7 +210,7 @@ class Tracker:
         points[~(seen[low] & seen[high])] = np.nan
         return Tracked(points, image.width(self._line.line))
 
-    def _area(self, image: DloImage, line: Floats) -> float:
+    def _expected_area(self, image: DloImage, line: Floats) -> float:
         """Return the area that usually has the DLO's colour [px^2]."""
         return self._shown * max(image.width(line) * float(arc_lengths(line)[-1]), 1.0)
 
@@ -223,8 +223,9 @@ class Tracker:
         if found.seen.mean() < LEAST:
             return 'too little of the DLO is seen: take hands out of the way, and move it slowly'
         _, others = shown_places(image, found.line, self._shown)
-        unexplained = area(others, reduction(image.width(found.line))) / self._area(image, found.line)
-        least = LEAST_PART * image.width(found.line) / float(arc_lengths(found.line)[-1])
+        width = image.width(found.line)
+        unexplained = area(others, reduction(width)) / self._expected_area(image, found.line)
+        least = LEAST_PART * width / float(arc_lengths(found.line)[-1])
         if unexplained > self._usual + max(UNEXPLAINED, least):
             return ELSEWHERE
         # The picture of a camera in the hand shows more or less of other things.
