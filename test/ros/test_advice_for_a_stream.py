@@ -43,6 +43,8 @@ class Tracked(ToyGraph):
             self.elapsed += 1 / RATE
             self.now += SECOND // RATE
             self.send([(GOAL, chain_cloud(TYPES, seen, self.now, 'world'))])
+            # The thread does not know this clock.
+            self.until(lambda: not self.session._live_information.alive)
 
     def lose(self, seconds):
         """Show nothing."""
