@@ -11,6 +11,7 @@ which looks longer or shorter: that part is guessed (`lift`).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Sequence
 
 import numpy as np
 
@@ -84,16 +85,8 @@ class Shown:
 def elastic_line(image: DloImage, before: TrackedLine, shown: Shown) -> TrackedLine:
     """Return the line through what an image shows; `seen` is still that of the line before."""
     fit = _Fit(image, before, shown)
-    covered = [0.0 if end is None else end.strange for end in shown.ends]
-    accepted = np.array([end is not None for end in shown.ends])
     lift = before.lift.behind([None if end is None else end.strange for end in shown.ends])
-    most = int(np.argmax(covered))
-    if (covered[most] > STRANGE > covered[1 - most]
-            or not all(accepted) and lift.held != 1 - most and lift.strange[most] > STRANGE_ALONE):
-        accepted[most] = False
-    # A hand covers both ends; it does not look strange in each image.
-    if np.maximum(covered, lift.strange).min() > STRANGE:
-        accepted[:] = False
+    accepted = _uncovered(shown.ends, lift)
     if all(accepted):
         line = fit.through(accepted)
         excess = fit.excess(line)
@@ -123,6 +116,20 @@ def elastic_line(image: DloImage, before: TrackedLine, shown: Shown) -> TrackedL
         return found
     lifted = fit.lifted(whole, excess, replace(lift, centre=unsure * (len(whole) - 1.0)))
     return replace(found, line=lifted, excess=excess)
+
+
+def _uncovered(ends: Sequence[LineEnd | None], lift: Lift) -> Bools:
+    """Tell which ends (2,) are seen, and probably not covered by a hand."""
+    strange = [0.0 if end is None else end.strange for end in ends]
+    # A hand that covers both does not look strange in each image.
+    if np.maximum(strange, lift.strange).min() > STRANGE:
+        return np.full(2, False)
+    found = np.array([end is not None for end in ends])
+    most = int(np.argmax(strange))
+    alone = not all(found) and lift.held != 1 - most
+    if strange[most] > STRANGE > strange[1 - most] or alone and lift.strange[most] > STRANGE_ALONE:
+        found[most] = False
+    return found
 
 
 class _Fit:

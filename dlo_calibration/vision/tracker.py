@@ -132,12 +132,7 @@ class Tracker:
         """
         self._rescale(scale)
         image, before = self._image(pixels), self._line
-        found = followed(image, before, before.line + self._velocity * elapsed,
-                         WIDER if self._lost_for else FAR[0])
-        if np.isfinite(found.line).all():
-            straight = straight_on(found.line, image.width(found.line))
-            if straight is not found.line:
-                found = followed(image, replace(found, line=straight), straight, FAR[1])
+        found = self._followed(image, elapsed)
         reason, again = self._doubt(image, found), None
         if reason == ELSEWHERE or reason and self._lost_for % SEARCHES == SEARCHES - 1:
             again = self._again(image, found)
@@ -213,6 +208,15 @@ class Tracker:
     def _expected_area(self, image: DloImage, line: Floats) -> float:
         """Return the area that usually has the DLO's colour [px^2]."""
         return self._shown * max(image.width(line) * float(arc_lengths(line)[-1]), 1.0)
+
+    def _followed(self, image: DloImage, elapsed: float) -> TrackedLine:
+        """Return the line near where it is expected, along its loop the way in which it goes straight on."""
+        found = followed(image, self._line, self._line.line + self._velocity * elapsed,
+                         WIDER if self._lost_for else FAR[0])
+        if not np.isfinite(found.line).all():
+            return found
+        line = straight_on(found.line, image.width(found.line))
+        return found if line is found.line else followed(image, replace(found, line=line), line, FAR[1])
 
     def _doubt(self, image: DloImage, found: TrackedLine) -> str:
         """Return why a line is none, one sentence; empty: it is one."""

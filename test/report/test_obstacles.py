@@ -13,12 +13,7 @@ from toy_messages import toy_trials
 
 from dlo_calibration.report.drawing import session_picture
 from dlo_calibration.report.figure import OBSTACLE
-from dlo_calibration.report.obstacles import (
-    ABOVE,
-    MOST_TRIANGLES,
-    outline,
-    triangles_of,
-)
+from dlo_calibration.report.obstacles import ABOVE, MOST_TRIANGLES, outline, triangles_of
 from dlo_calibration.simulation.scene import NO_TRIANGLES, Obstacle, read_scene
 
 ASIDE = np.eye(3)[[0, 2]]  # the projection seen along y
