@@ -13,6 +13,7 @@ from scipy.linalg import solveh_banded
 from dlo_calibration.model.chain import Floats
 
 ITERATIONS = 4  # as a segment's length is no linear function of its ends
+ALONG = 0.01  # weight of second differences along the line, to that of those across
 BAND = 6  # diagonals of the normal equations: three points in a row are connected
 
 
@@ -28,7 +29,8 @@ class Evidence:
     :param anywhere: weight of that, in all directions.
     :param lengths: (n - 1,) of the segments [px].
     :param stretch: (n - 1,) weight of each of these lengths.
-    :param bend: weight of the second differences of `expected`.
+    :param bend: weight of the second differences of `expected`, across the line; along it, they change freely
+        with the lengths.
     :param kept: (n - 2,) share of those second differences that remains; below 1, the line becomes straight.
     :param ends: (2, 2) where both ends are seen [px].
     :param end_weights: (2,).
@@ -60,12 +62,12 @@ def fitted(start: Floats, known: Evidence) -> Floats:
         segments = np.diff(line, axis=0)
         units = segments / np.maximum(np.linalg.norm(segments, axis=1, keepdims=True), 1e-9)
         normal.add(np.stack([-units, units], axis=1), known.lengths, known.stretch)
+        for axes, bend in ((normals, known.bend), (tangents, ALONG * known.bend)):
+            stencil = np.array([1.0, -2.0, 1.0])[None, :, None] * axes[1:-1, None]
+            normal.add(stencil, _along(axes[1:-1], bends), np.full(len(bends), bend))
         everywhere = np.full(len(line), known.anywhere)
         for axis in np.eye(2):
             normal.add(np.broadcast_to(axis, (len(line), 1, 2)), known.expected @ axis, everywhere)
-            stencil = np.array([1.0, -2.0, 1.0])[None, :, None] * axis
-            normal.add(np.broadcast_to(stencil, (len(bends), 3, 2)), bends @ axis,
-                       np.full(len(bends), known.bend))
         for axis in np.eye(2):
             for k, first in enumerate((0, len(line) - 1)):
                 normal.add(axis[None, None], known.ends[k:k + 1] @ axis, known.end_weights[k:k + 1], first)

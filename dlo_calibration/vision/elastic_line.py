@@ -29,6 +29,7 @@ LOOSE = 0.01  # of the weight of the lengths, where it is measured how long the 
 BEND = 0.01  # half widths, standard deviation of a change of second differences from image to image
 KEPT = 0.9  # share of the bends that the line keeps from image to image where the DLO is not seen
 FREE = (10.0, 1.5)  # half widths, deviation from where the line is expected: if an end is seen, or none
+STILL = 0.3  # the same, along the half of the DLO whose end is hidden by the hand that holds the other one
 END = 0.1  # half widths, standard deviation of an end
 HIDDEN = 0.1  # of the weight of the place that is seen best, below which one is hidden
 GUESSED = 0.2  # of a segment's length: standard deviation of how long a part in the air looks
@@ -84,8 +85,13 @@ class Shown:
 
 def elastic_line(image: DloImage, before: TrackedLine, shown: Shown) -> TrackedLine:
     """Return the line through what an image shows; `seen` is still that of the line before."""
-    fit = _Fit(image, before, shown)
-    lift = before.lift.behind([None if end is None else end.strange for end in shown.ends])
+    first, last = shown.ends
+    apart = np.inf if first is None or last is None else float(np.linalg.norm(last.place - first.place))
+    strange = [None if end is None else end.strange for end in shown.ends]
+    lift = before.lift.behind(strange, apart / shown.half)
+    if lift.hides is not None:
+        shown = replace(shown, ends=(None, last) if lift.hides == 0 else (first, None))
+    fit = _Fit(image, before, shown, lift.hides)
     accepted = _uncovered(shown.ends, lift)
     if all(accepted):
         line = fit.through(accepted)
@@ -101,7 +107,7 @@ def elastic_line(image: DloImage, before: TrackedLine, shown: Shown) -> TrackedL
         unsure = int(np.argmax(moved)) if lift.held is None else lift.held
         accepted[unsure] = False
     ends = (bool(accepted[0]), bool(accepted[1]))
-    if not any(ends) and lift.held is not None and shown.ends[1 - lift.held] is None:
+    if not any(ends) and lift.held is not None and lift.hides is None and shown.ends[1 - lift.held] is None:
         accepted[1 - lift.held] = True  # no hand hides that end: it goes on as before
     found = replace(before, line=fit.through(accepted), ends=ends, excess=0.0, lift=lift)
     if not any(ends) or lift.held is None:
@@ -135,8 +141,10 @@ def _uncovered(ends: Sequence[LineEnd | None], lift: Lift) -> Bools:
 class _Fit:
     """The lines that fit what an image shows."""
 
-    def __init__(self, image: DloImage, before: TrackedLine, shown: Shown) -> None:
+    def __init__(self, image: DloImage, before: TrackedLine, shown: Shown, hides: int | None) -> None:
         count, half = len(shown.near), shown.half
+        # No hand holds the end that one hides: that half of the DLO does not slide along itself.
+        self._still = (np.s_[:0], np.s_[:count // 2], np.s_[count // 2:])[0 if hides is None else 1 + hides]
         self._before, self._shown, self._length = before, shown, image.dlo.length
         self._fineness = image.finenesses(shown.near)
         self._lengths = self._length / (count - 1) * self._fineness
@@ -158,9 +166,10 @@ class _Fit:
 
         :param stretch: share of the weight of its lengths.
         """
-        free = 1.0 / (FREE[1] * self._shown.half) ** 2
+        free = np.full(len(self._shown.near), FREE[0] if any(accepted) else FREE[1])
+        free[self._still] = STILL
         known = replace(self._known, end_weights=np.where(accepted, self._known.end_weights, 0.0),
-                        along=self._known.along if any(accepted) else np.full_like(self._known.along, free),
+                        along=1.0 / (free * self._shown.half) ** 2,
                         stretch=stretch * self._known.stretch)
         return fitted(self._shown.near, known)
 

@@ -21,6 +21,7 @@ from dlo_calibration.vision.appearance import Bools
 
 BESIDE = 2.0  # points: standard deviation of a filter, which tells what is beside a hidden part
 HELD = 6.0  # difference between both ends, from which on a hand seems to hold one of them
+ONE_PLACE = 4.0  # half widths between both ends, below which the hand that holds one hides the other, too
 NEWEST = 0.3  # share of what is new in an image
 BOTH = 0.3  # share of the way of the end that moved farthest, from which on the other one moved, too
 CHANGED = 4.0  # times as far: from then on a hand seems to hold an end after all
@@ -36,6 +37,7 @@ class Lift:
     :param strange: (2,) distance in L, a, b of what is behind an end from the ground, as a mean over images;
         not a number: no image has shown it yet.
     :param held: the end, 0 or 1, that a hand last seemed to hold since then; None: neither.
+    :param hides: the other end, if that hand hides it, too; None: it does not.
     :param ends: (2,) how far the ends have been from where they rested [px].
     :param middle: how far a part that was hidden has been [px].
     :param raises: whether a hand seems to lift the middle, and not an end.
@@ -45,6 +47,7 @@ class Lift:
     rested: Floats
     strange: Floats
     held: int | None
+    hides: int | None
     ends: Floats
     middle: float
     raises: bool
@@ -53,19 +56,32 @@ class Lift:
     @classmethod
     def of(cls, line: Floats, strange: Floats) -> Lift:
         """Return the state of a line that lies on the table: nothing is lifted."""
-        return cls(line, strange, None, np.zeros(2), 0.0, False, (len(line) - 1) / 2)
+        return cls(line, strange, None, None, np.zeros(2), 0.0, False, (len(line) - 1) / 2)
 
     @property
     def shows_hand(self) -> bool:
         """Whether it is stranger behind one end than behind the other, as where a hand holds it."""
         return bool(abs(self.strange[0] - self.strange[1]) > HELD)
 
-    def behind(self, strange: Sequence[float | None]) -> Lift:
-        """Return the state with what an image shows behind both ends; None: it does not show that end."""
-        means = [mean if new is None else new if np.isnan(mean) else mean + NEWEST * (new - mean)
-                 for new, mean in zip(strange, self.strange.tolist(), strict=True)]
-        now = replace(self, strange=np.array(means))
-        return replace(now, held=int(np.argmax(means))) if now.shows_hand else now
+    def behind(self, strange: Sequence[float | None], apart: float) -> Lift:
+        """
+        Return the state with what an image shows behind both ends.
+
+        :param strange: None: it does not show that end.
+        :param apart: half widths between both ends.
+        """
+        new, mean = np.array(strange, float), self.strange
+        hides = None
+        if self.held is not None:
+            other = 1 - self.held
+            # Where one hand has both, the DLO seems to end twice at its border.
+            meets = apart < ONE_PLACE and mean.max() > HELD
+            if meets or self.hides is not None and not new[other] <= HELD:
+                hides, new[other] = other, np.nan
+        mean = np.where(np.isnan(new), mean, np.where(np.isnan(mean), new, mean + NEWEST * (new - mean)))
+        now = replace(self, strange=mean)
+        held = int(np.argmax(mean)) if now.shows_hand else self.held
+        return replace(now, held=held, hides=hides if held == self.held else None)
 
     def seen(self, line: Floats, ends: Floats, shown: Bools, least: float) -> Lift:
         """

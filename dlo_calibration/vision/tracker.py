@@ -276,5 +276,18 @@ class Tracker:
         rests = TrackedLine(line, np.ones(count, bool), (True, True), 0.0,
                             Lift.of(line, np.full(2, np.nan)))
         found = followed(image, rests, line, FAR[1])
+        if found.ends[0] != found.ends[1]:  # how much of the DLO is hidden at the other end is known
+            line = _from_end(image, line, 0 if found.ends[0] else 1, self._dlo.length)
+            found = followed(image, replace(rests, line=line), line, FAR[1])
         sure = (all if whole else any)(found.ends) and -WRONG_LENGTH < found.excess < IN_AIR
         return found if sure and not self._doubt(image, found) else None
+
+
+def _from_end(image: DloImage, line: Floats, end: int, length: float) -> Floats:
+    """Return a line (n, 2) [px] of some length from an end (0 or 1) of another one, which it prolongs."""
+    way = line if end == 0 else line[::-1]
+    arc = image.arc_lengths(way)
+    slope = (way[-1] - way[-1 - TIP]) / (arc[-1] - arc[-1 - TIP])
+    places = np.linspace(0.0, length, len(line))
+    found = along_line(way, arc, places) + np.maximum(places - arc[-1], 0.0)[:, None] * slope
+    return np.asarray(found if end == 0 else found[::-1])

@@ -11,6 +11,7 @@ from dlo_calibration.vision.lift import Lift
 LINE = np.column_stack([np.linspace(0.0, 300.0, 61), np.zeros(61)])
 SHOWN = np.ones(61, bool)
 LEAST = 1.0  # px
+APART = 50.0  # half widths between both ends
 
 
 def hidden(centre, reach=3):
@@ -58,23 +59,41 @@ def test_a_hand_behind_an_end_holds_that_end():
     ends = LINE[[0, -1]] + [[6.0, 0.0], [-5.0, 0.0]]
     lift = Lift.of(LINE, np.zeros(2))
     for _ in range(5):
-        lift = lift.behind([30.0, 2.0])
+        lift = lift.behind([30.0, 2.0], APART)
     assert lift.held == 0
     assert not lift.seen(LINE, ends, hidden(30), LEAST).raises
     # An end that is not seen changes nothing; one image alone does not, either.
-    assert lift.behind([None, None]).held == 0
-    assert lift.behind([2.0, 2.0]).held == 0
+    assert lift.behind([None, None], np.inf).held == 0
+    assert lift.behind([2.0, 2.0], APART).held == 0
     # A part of the DLO that it bends over itself hides the hand, and looks like an end.
     for _ in range(10):
-        lift = lift.behind([2.0, 1.0])
+        lift = lift.behind([2.0, 1.0], APART)
     assert (lift.held, lift.shows_hand) == (0, False)
     assert not lift.seen(LINE, ends, hidden(30), LEAST).raises
     # The DLO lies on the table again; the hand comes to the other end.
     lift = Lift.of(LINE, lift.strange)
     assert lift.held is None
     for _ in range(5):
-        lift = lift.behind([2.0, 30.0])
+        lift = lift.behind([2.0, 30.0], APART)
     assert lift.held == 1
+
+
+def test_a_hand_that_brings_one_end_to_the_other_hides_that_one_until_there_is_nothing_behind_it():
+    lift = Lift.of(LINE, np.zeros(2))
+    # Two ends that lie side by side, and no hand.
+    assert lift.behind([1.0, 2.0], 2.5).hides is None
+    for _ in range(5):
+        lift = lift.behind([1.0, 30.0], APART)
+    assert (lift.held, lift.hides) == (1, None)
+    # Where the hand has both, it may hide itself.
+    for strange in ([30.0, 30.0], [2.0, 2.0], [None, 1.0]):
+        lift = lift.behind(strange, 1.5)
+        assert (lift.held, lift.hides) == (1, 0)
+    # It lets go of its end, and is still over the other one; then it goes.
+    lift = lift.behind([30.0, 1.0], APART)
+    assert lift.hides == 0
+    assert lift.behind([None, 1.0], np.inf).hides == 0
+    assert lift.behind([1.0, 1.0], APART).hides is None
 
 
 def test_nothing_moved_and_nothing_is_raised():

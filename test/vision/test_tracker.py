@@ -275,6 +275,17 @@ def test_a_line_that_has_come_off_while_a_hand_hides_the_middle_finds_back():
         assert np.isfinite(off[1:9]).all() and np.isfinite(off[16:-1]).all()
 
 
+def test_a_line_that_has_come_off_while_a_hand_hides_an_end_finds_back():
+    curve, scale = bent(0.9), scale_of(CAMERA)
+    renderer().restart(0)
+    tracker, end = come_off(curve, scale), Hand((0.35, float(np.interp(0.35, curve[:, 0], curve[:, 1]))))
+    pixels = renderer().image([Instant(CAMERA, curve, (end,))])
+    for _ in range(4):
+        off = errors(tracker.next(pixels, STEP, scale), curve)
+        assert np.nanmax(off) < FAR
+        assert np.isfinite(off[1:16]).all()
+
+
 @pytest.mark.long
 def test_beyond_a_hidden_part_a_line_that_was_assembled_counts_only_once_its_end_is_seen():
     curve, scale = bent(0.9), scale_of(CAMERA)
@@ -502,3 +513,21 @@ def test_between_two_hands_the_line_does_not_go_on_sliding_when_the_dlo_has_stop
     off = errors(found, curves[-1])
     assert np.isfinite(off[4:-4]).all()
     assert np.nanmax(off) < 1.5 * FAR
+
+
+def hairpin(turn):
+    """Return a DLO (n, 3) [m] whose legs make an angle; the first leg stays where it is."""
+    angle = turn * np.clip(np.linspace(-0.35, 0.65, 401) / 0.3, 0.0, 1.0)
+    steps = np.column_stack([np.cos(angle), np.sin(angle)]) * LENGTH / 400
+    flat = np.concatenate([[[0.0, 0.0]], np.cumsum(steps[:-1], axis=0)])
+    return np.column_stack([flat, np.full(401, RADIUS)])
+
+
+@pytest.mark.long
+def test_points_stay_on_their_material_while_one_hand_brings_both_ends_together():
+    turns = np.concatenate([np.linspace(2.6, 3.66, 30), np.full(30, 3.66)])
+    curves = [hairpin(turn) for turn in turns]
+    hands = [(Hand(tuple(curve[-1, :2] + (0.0, 0.005)), 3.6),) if k else () for k, curve in enumerate(curves)]
+    for one, curve in zip(tracked(curves, hands), curves, strict=True):
+        assert not one.lost
+        assert np.nanmax(errors(one, curve)) < FAR
