@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.ndimage import gaussian_filter1d
+from scipy.ndimage import gaussian_filter1d, label
 from scipy.spatial import cKDTree
 
 from dlo_calibration.model.chain import Floats, frozen_array
@@ -52,6 +52,7 @@ SHEET_ALIKE = 0.1  # share of a part of the sheet that has the DLO's colour, fro
 SEARCHES = 10  # images from one search of the whole picture to the next
 ELSEWHERE = 'the DLO is also where the line is not: move it slowly, or start again with new clicks'
 COVERED = 0.7  # share of the curves between parts of the DLO where something covers the ground, at least
+GAP = 0.05  # share of the line: how much of a longer gap is hidden is not known while one end is not seen
 TIP = 4  # stations at an end that may not be seen, though the end is
 PARTS = 4  # of the DLO between what hides it, at most, from which the line is assembled
 
@@ -196,11 +197,11 @@ class Tracker:
         place = np.linspace(0, len(self._line.line) - 1, self._count)
         points = along_line(self._line.line, np.arange(float(len(self._line.line))), place)
         low, high = np.floor(place).astype(int), np.ceil(place).astype(int)
-        seen = self._line.seen
-        if self._assembled:
-            # How much of the DLO is hidden is not known: only what a visible end is part of counts.
-            inner = np.r_[np.full(TIP, True), seen[TIP:-TIP], np.full(TIP, True)]
-            hidden, ends = np.cumsum(~inner), self._line.ends
+        seen, ends = self._line.seen, self._line.ends
+        if self._assembled or any(ends):
+            # How much of the DLO a hand hides is not known: only what a visible end is part of counts.
+            shown = seen | ~image.inside(self._line.line, 0.0)
+            hidden = np.cumsum(_gaps(shown, 0.0 if self._assembled else GAP * len(seen)))
             seen = seen & (ends[0] & (hidden == 0) | ends[1] & (hidden == hidden[-1]))
         points[~(seen[low] & seen[high])] = np.nan
         return Tracked(points, image.width(self._line.line))
@@ -281,6 +282,13 @@ class Tracker:
             found = followed(image, replace(rests, line=line), line, FAR[1])
         sure = (all if whole else any)(found.ends) and -WRONG_LENGTH < found.excess < IN_AIR
         return found if sure and not self._doubt(image, found) else None
+
+
+def _gaps(shown: Bools, longest: float) -> Bools:
+    """Tell which points (n,) of a line lie in gaps of more than so many that are not shown; not at an end."""
+    hidden = np.r_[np.full(TIP, False), ~shown[TIP:-TIP], np.full(TIP, False)]
+    gaps, _ = label(hidden)
+    return np.asarray(hidden & (np.bincount(gaps)[gaps] > longest))
 
 
 def _from_end(image: DloImage, line: Floats, end: int, length: float) -> Floats:

@@ -302,6 +302,23 @@ def test_beyond_a_hidden_part_a_line_that_was_assembled_counts_only_once_its_end
 
 
 @pytest.mark.long
+@pytest.mark.parametrize('width, beyond', [(0.0, True), (0.05, False)])
+def test_beyond_a_long_hidden_part_points_count_only_where_their_end_is_seen(width, beyond):
+    def drawn(pixels, k):
+        for middle, reach in ((0.25, 0.01 + width), (0.5, 0.06)) if k else ():
+            sides = ((-reach, -0.3), (reach, -0.3), (reach, 0.3), (-reach, 0.3))
+            corners = CAMERA.project([[middle + x, y, 0.0] for x, y in sides])
+            cv2.fillPoly(pixels, [np.rint(corners).astype(np.int32)], (190, 140, 110))
+        return pixels
+
+    curve = bent(0.3)
+    for one in tracked([curve] * 6, drawn=drawn)[1:]:
+        off = errors(one, curve)
+        assert np.isfinite(off[1:7]).all() and np.nanmax(off) < FAR
+        assert np.isfinite(off[14:17]).all() == beyond
+
+
+@pytest.mark.long
 def test_blur_is_no_obstacle():
     curves = moving(8)
     rendered = renderer()
