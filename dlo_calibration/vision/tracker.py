@@ -63,7 +63,7 @@ class Tracked:
     Where a DLO is in an image.
 
     :param pixels: (count, 2) [px], evenly along the DLO: the same material points in each image; not a number
-        where the DLO is not seen.
+        where the DLO is not seen, or nobody knows how much of it a hand hides before.
     :param width: of the DLO [px].
     :param reason: why the DLO is lost, one sentence; empty: it is not.
     """
