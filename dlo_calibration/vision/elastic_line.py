@@ -85,11 +85,9 @@ class Shown:
 
 def elastic_line(image: DloImage, before: TrackedLine, shown: Shown) -> TrackedLine:
     """Return the line through what an image shows; `seen` is still that of the line before."""
-    first, last = shown.ends
-    apart = np.inf if first is None or last is None else float(np.linalg.norm(last.place - first.place))
-    strange = [None if end is None else end.strange for end in shown.ends]
-    lift = before.lift.behind(strange, apart / shown.half)
+    lift = _held_now(before.lift, shown)
     if lift.hides is not None:
+        first, last = shown.ends
         shown = replace(shown, ends=(None, last) if lift.hides == 0 else (first, None))
     fit = _Fit(image, before, shown, lift.hides)
     accepted = _uncovered(shown.ends, lift)
@@ -122,6 +120,13 @@ def elastic_line(image: DloImage, before: TrackedLine, shown: Shown) -> TrackedL
         return found
     lifted = fit.lifted(whole, excess, replace(lift, centre=unsure * (len(whole) - 1.0)))
     return replace(found, line=lifted, excess=excess)
+
+
+def _held_now(lift: Lift, shown: Shown) -> Lift:
+    """Return which end a hand seems to hold, with what an image shows behind both ends."""
+    first, last = shown.ends
+    apart = np.inf if first is None or last is None else float(np.linalg.norm(last.place - first.place))
+    return lift.behind([None if end is None else end.strange for end in shown.ends], apart / shown.half)
 
 
 def _uncovered(ends: Sequence[LineEnd | None], lift: Lift) -> Bools:
