@@ -29,8 +29,8 @@ class Evidence:
     :param anywhere: weight of that, in all directions.
     :param lengths: (n - 1,) of the segments [px].
     :param stretch: (n - 1,) weight of each of these lengths.
-    :param bend: weight of the second differences of `expected`, across the line; along it, they change freely
-        with the lengths.
+    :param bend: weight of the second differences of `expected` across the line; those along it, by which
+        neighbouring lengths differ, hardly count.
     :param kept: (n - 2,) share of those second differences that remains; below 1, the line becomes straight.
     :param ends: (2, 2) where both ends are seen [px].
     :param end_weights: (2,).

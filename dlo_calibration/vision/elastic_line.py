@@ -26,7 +26,7 @@ from dlo_calibration.vision.middle_line import arc_lengths
 STRETCH = 0.02  # of a segment's length: standard deviation; a part in the air looks longer
 UNSCALED_STRETCH = 0.05  # the same in a picture without a scale
 LOOSE = 0.01  # of the weight of the lengths, where it is measured how long the DLO looks
-BEND = 0.01  # half widths, standard deviation of a change of second differences from image to image
+BEND = 0.01  # half widths, standard deviation of a change of second differences across it, between images
 KEPT = 0.9  # share of the bends that the line keeps from image to image where the DLO is not seen
 FREE = (10.0, 1.5)  # half widths, deviation from where the line is expected: if an end is seen, or none
 STILL = 0.3  # the same, along the half of the DLO whose end is hidden by the hand that holds the other one
@@ -149,7 +149,8 @@ class _Fit:
     def __init__(self, image: DloImage, before: TrackedLine, shown: Shown, hides: int | None) -> None:
         count, half = len(shown.near), shown.half
         # No hand holds the end that one hides: that half of the DLO does not slide along itself.
-        self._still = (np.s_[:0], np.s_[:count // 2], np.s_[count // 2:])[0 if hides is None else 1 + hides]
+        first_half = np.arange(count) < count // 2
+        self._still = np.zeros(count, bool) if hides is None else first_half == (hides == 0)
         self._before, self._shown, self._length = before, shown, image.dlo.length
         self._fineness = image.finenesses(shown.near)
         self._lengths = self._length / (count - 1) * self._fineness

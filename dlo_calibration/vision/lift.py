@@ -5,7 +5,8 @@
 Lift: which part of a DLO a hand seems to lift since all of it lay on the table.
 
 A hand that lifts an end hides how long the DLO looks there; one that lifts another part makes the DLO look
-longer or shorter around itself, while both ends are seen.  That part has moved farthest.
+longer or shorter around itself, while both ends are seen.  That part has moved farthest.  A hand that brings
+the end that it holds to the other one hides that one, too.
 """
 
 from __future__ import annotations

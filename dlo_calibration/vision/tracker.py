@@ -52,8 +52,9 @@ SHEET_ALIKE = 0.1  # share of a part of the sheet that has the DLO's colour, fro
 SEARCHES = 10  # images from one search of the whole picture to the next
 ELSEWHERE = 'the DLO is also where the line is not: move it slowly, or start again with new clicks'
 COVERED = 0.7  # share of the curves between parts of the DLO where something covers the ground, at least
-GAP = 0.05  # share of the line: how much of a longer gap is hidden is not known while one end is not seen
+GAP = 0.05  # share of the line: in a longer gap, a hand may hide more or less of the DLO than the line has
 TIP = 4  # stations at an end that may not be seen, though the end is
+LAST = 4  # stations at an end, whose direction goes on beyond it
 PARTS = 4  # of the DLO between what hides it, at most, from which the line is assembled
 
 
@@ -63,7 +64,7 @@ class Tracked:
     Where a DLO is in an image.
 
     :param pixels: (count, 2) [px], evenly along the DLO: the same material points in each image; not a number
-        where the DLO is not seen, or nobody knows how much of it a hand hides before.
+        where the DLO is not seen, nor beyond a longer part that a hand hides while the end there is not seen.
     :param width: of the DLO [px].
     :param reason: why the DLO is lost, one sentence; empty: it is not.
     """
@@ -199,9 +200,9 @@ class Tracker:
         low, high = np.floor(place).astype(int), np.ceil(place).astype(int)
         seen, ends = self._line.seen, self._line.ends
         if self._assembled or any(ends):
-            # How much of the DLO a hand hides is not known: only what a visible end is part of counts.
+            # A hand may hide more or less than that: only what a visible end is part of counts.
             shown = seen | ~image.inside(self._line.line, 0.0)
-            hidden = np.cumsum(_gaps(shown, 0.0 if self._assembled else GAP * len(seen)))
+            hidden = np.cumsum(_long_gaps(shown, 0.0 if self._assembled else GAP * len(seen)))
             seen = seen & (ends[0] & (hidden == 0) | ends[1] & (hidden == hidden[-1]))
         points[~(seen[low] & seen[high])] = np.nan
         return Tracked(points, image.width(self._line.line))
@@ -277,14 +278,14 @@ class Tracker:
         rests = TrackedLine(line, np.ones(count, bool), (True, True), 0.0,
                             Lift.of(line, np.full(2, np.nan)))
         found = followed(image, rests, line, FAR[1])
-        if found.ends[0] != found.ends[1]:  # how much of the DLO is hidden at the other end is known
+        if found.ends[0] != found.ends[1]:  # the rest of its length is hidden at the other end
             line = _from_end(image, line, 0 if found.ends[0] else 1, self._dlo.length)
             found = followed(image, replace(rests, line=line), line, FAR[1])
         sure = (all if whole else any)(found.ends) and -WRONG_LENGTH < found.excess < IN_AIR
         return found if sure and not self._doubt(image, found) else None
 
 
-def _gaps(shown: Bools, longest: float) -> Bools:
+def _long_gaps(shown: Bools, longest: float) -> Bools:
     """Tell which points (n,) of a line lie in gaps of more than so many that are not shown; not at an end."""
     hidden = np.r_[np.full(TIP, False), ~shown[TIP:-TIP], np.full(TIP, False)]
     gaps, _ = label(hidden)
@@ -295,7 +296,7 @@ def _from_end(image: DloImage, line: Floats, end: int, length: float) -> Floats:
     """Return a line (n, 2) [px] of some length from an end (0 or 1) of another one, which it prolongs."""
     way = line if end == 0 else line[::-1]
     arc = image.arc_lengths(way)
-    slope = (way[-1] - way[-1 - TIP]) / (arc[-1] - arc[-1 - TIP])
+    slope = (way[-1] - way[-1 - LAST]) / (arc[-1] - arc[-1 - LAST])
     places = np.linspace(0.0, length, len(line))
     found = along_line(way, arc, places) + np.maximum(places - arc[-1], 0.0)[:, None] * slope
     return np.asarray(found if end == 0 else found[::-1])
