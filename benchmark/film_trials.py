@@ -143,7 +143,7 @@ def main():
     parser.add_argument('--objects', type=int, default=5)
     parser.add_argument('--first', type=int, default=0, help='number of the first object')
     parser.add_argument('--films', type=int, default=2, help='of each')
-    parser.add_argument('--width', type=int, default=1280, help='of the images [px]')
+    parser.add_argument('--width', type=int, default=1920, help='of the images [px]')
     parser.add_argument('--folder', type=Path, help='of films and figures (default: a temporary one)')
     options = parser.parse_args()
     films, fits = {}, {}

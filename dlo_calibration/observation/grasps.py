@@ -29,8 +29,9 @@ from dlo_calibration.observation.sightings import (
 
 STILL = 0.015  # m/s; a hand that moves slower stands still
 WAY = 0.012  # m; the shortest way of a hand that moves a DLO
-PLACES = 201  # along the DLO at which a hand may hold it
-MOST, ROUNDS = 60, 4  # pictures in which they are compared, and weightings of these
+PLACES = 601  # along the DLO at which a hand may hold it
+MOST, ROUNDS = 60, 4  # pictures in which they are compared, and rounds of a fit to them
+LOW = 0.3  # height of a line of sight over the table, of its length; a lower one hardly shows a turn
 DOUBTED = 0.006  # m; a picture in which a place is farther from where it is in the hand hardly counts
 BRIDGED = 0.2  # share of the length to both sides of a place, in which the DLO must be seen
 PARTED = 5  # pictures in a row that show hand and DLO apart
@@ -105,9 +106,11 @@ def _moved_by(seen: Sightings, hand: HandSightings, speed: Floats, initial: Chai
         return None
     there = near[near <= closes]
     there = there[np.linalg.norm(hand.positions[there] - begin, axis=1) < AT_REST]
+    sights = np.tile([0.0, 0.0, 1.0], (len(times), 1)) if seen.cameras is None else (
+        seen.cameras - hand.positions)
     compared = span[np.unique(np.linspace(0, len(span) - 1, min(len(span), MOST)).astype(int))]
     turned = [np.tile(NO_ROTATION, (len(times), 1))] if hand.orientations is None else [
-        hand.orientations, _about_vertical(hand.orientations, shown)]
+        hand.orientations, _about_vertical(hand.orientations, sights, span)]
     motion = min((_motion(seen, hand, rotations, initial, closes, there, compared) for rotations in turned),
                  key=lambda motion: motion.costs.min())
     return motion if motion.typical[motion.costs.argmin()] < HELD else None
@@ -170,21 +173,31 @@ class _Motion:
                      closes, opens, lifts)
 
 
-def _about_vertical(orientations: Floats, start: int) -> Floats:
+def _about_vertical(orientations: Floats, sights: Floats, pictures: NDArray[np.intp]) -> Floats:
     """
-    Return the part of the turning that is about the vertical, (n, 4), since a picture.
+    Return the orientations (n, 4) of a hand that turns about the vertical alone, with one tilt all the time.
 
     A small tag that the camera sees from straight ahead looks the same while it tilts a little; how it turns
-    about the line of sight is seen well.
+    about the line of sight is seen well, and says how far the hand has turned.
+
+    :param sights: (n, 3) from the tag to the camera [m].
+    :param pictures: those that determine the tilt.
     """
     from scipy.spatial.transform import Rotation  # takes a quarter of a second to load
 
     turned = np.full_like(orientations, np.nan)
-    known = np.isfinite(orientations[:, 0])
-    first = Rotation.from_quat(orientations[start])
-    since = (Rotation.from_quat(orientations[known]) * first.inv()).as_matrix()
-    angle = np.arctan2(since[:, 1, 0] - since[:, 0, 1], since[:, 0, 0] + since[:, 1, 1])
-    turned[known] = (Rotation.from_rotvec(angle[:, None] * [0.0, 0.0, 1.0]) * first).as_quat()
+    known = np.isfinite(orientations[:, 0]) & np.isfinite(sights[:, 0])
+    seen, count = Rotation.from_quat(orientations[known]), np.cumsum(known) - 1
+    sight = sights[known]
+    sight = sight / np.maximum(sight[:, 2:], LOW * np.linalg.norm(sight, axis=1, keepdims=True))
+    matrices = seen.as_matrix()
+    yaw = np.unwrap(np.arctan2(matrices[:, 1, 0] - matrices[:, 0, 1], matrices[:, 0, 0] + matrices[:, 1, 1]))
+    for _ in range(ROUNDS):
+        about = Rotation.from_rotvec(yaw[:, None] * [0.0, 0.0, 1.0])
+        tilt = (about.inv() * seen)[count[pictures[known[pictures]]]].mean()
+        away = (seen * (about * tilt).inv()).as_rotvec()
+        yaw = yaw + (away * sight).sum(axis=1)
+    turned[known] = (Rotation.from_rotvec(yaw[:, None] * [0.0, 0.0, 1.0]) * tilt).as_quat()
     return turned
 
 

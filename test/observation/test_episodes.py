@@ -5,9 +5,10 @@
 
 from dataclasses import replace
 
-from filmed_hands import CLOSES, COUNT, filmed_hand, OPENS, RADIUS
+from filmed_hands import CAMERA, CLOSES, COUNT, filmed_hand, OPENS, RADIUS
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from dlo_calibration.observation.episodes import Bounds, episodes
 from dlo_calibration.observation.sightings import HandSightings, Sightings
@@ -29,16 +30,34 @@ def test_the_hand_and_the_held_point_are_found(place, way, turn):
     seen, hand, grip = filmed_hand(place, way=way, turn=turn)
     (episode,), problems = episodes(seen, [hand])
     assert not problems
-    # Where the hand does not turn, hardly anything distinguishes the held point from its neighbours.
-    assert episode.places[0] == pytest.approx(place, abs=0.03 if turn else 0.05)
+    # Where the hand does not turn, hardly anything distinguishes the held point from its neighbours: the one
+    # nearest to the tag counts, which is 29 mm, 5 % of the length, along the DLO.
+    assert episode.places[0] == pytest.approx(place, abs=0.03 if turn else 0.055)
     path, = episode.hands
     assert CLOSES - 0.5 <= path.start <= CLOSES + 0.15
     assert OPENS - 0.1 <= path.end <= OPENS + 0.1
     truth = np.stack([np.interp(path.times, seen.times, axis) for axis in grip.T], axis=1)
     error = path.positions - truth
-    # Along the DLO, the place of the grip is known to 5 % of the length.
     assert np.linalg.norm(error - error.mean(axis=0), axis=1).max() < 0.01
-    assert np.linalg.norm(error.mean(axis=0)) < 0.035
+    assert np.linalg.norm(error.mean(axis=0)) < 0.037
+
+
+def test_a_tag_seen_from_straight_ahead_shows_how_far_the_hand_turns():
+    # Its tilt across the line of sight is not seen well there.
+    seen, hand, _ = filmed_hand(turn=-30.0)
+    turned = Rotation.from_quat(hand.orientations)
+    sight = CAMERA - hand.positions
+    across = np.cross(sight, [1.0, 0.0, 0.0])
+    ahead = np.clip(((CLOSES + OPENS) / 2 - seen.times) / 0.8, 0.0, 1.0)
+    error = Rotation.from_rotvec(np.deg2rad(9.0 * ahead)[:, None]
+                                 * across / np.linalg.norm(across, axis=1, keepdims=True))
+    tilted = error * turned * Rotation.from_euler('x', -25.0, degrees=True)
+    (episode,), _ = episodes(seen, [replace(hand, orientations=tilted.as_quat())])
+    path, = episode.hands
+    found = Rotation.from_quat(path.orientations)
+    true = turned[np.searchsorted(seen.times, path.times)]
+    away = (found * found[0].inv()) * (true * true[0].inv()).inv()
+    assert np.rad2deg(away.magnitude()).max() < 1.0
 
 
 def test_goals_show_the_moving_dlo_at_its_instants_and_then_its_rest():
