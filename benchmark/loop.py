@@ -10,6 +10,8 @@ FOLDER (default: the folder adapteddlo_muj of DLO_DATA) has `black0.jpg`, `black
 `red0` and `white0` from the public repository qj25/adapteddlo_muj (folder adapteddlo_muj/data/dlo_muj_real):
 wires of 1.5 m between two horizontal clamps 0.12 m apart, and the pixels that its authors clicked along them.
 They are not part of the package; a wire whose files are not there is left out, and the benchmark says so.
+The pixels of each wire hung again (`black1_data.pickle` to `black4_data.pickle`, whose photographs the source
+does not have) say how much EI differs from one time to the next.
 Each is traced from 4 to 25 clicks along that annotation, exact or 40 pixels off; the two at the clamps are
 always exact, as the picture shows these places.  EI is fitted to the line, to the annotation and to the
 points of the line beside the annotation, with the clamps' direction from a click inside each, and to the line
@@ -45,6 +47,7 @@ LENGTH = 1.5  # m, from the source
 POINTS = 51  # that the annotation has, and that are compared
 OFF = 40.0  # px, a hundredth of the picture: how far a person's clicks are off
 DRAWS = 5
+HUNG = 5  # times that each wire was
 ALLOWED = {('numpy.core.multiarray', '_reconstruct'), ('numpy', 'ndarray'), ('numpy', 'dtype')}
 
 
@@ -149,6 +152,10 @@ def compare(wire: Wire, folder: Path) -> tuple[list[Row], list[Row], str]:
         fits.append((name, *stiffness(wire, line, photograph.size)))
     name = '4 exact clicks, none inside the clamps'
     fits.append((name, *stiffness(wire, lines[4, 0.0], photograph.size, in_clamps=False)))
+    for k in range(1, HUNG):
+        if (again := folder / f'{wire.name}{k}_data.pickle').exists():
+            fits.append((f'the annotation of the wire hung again ({k})',
+                         *stiffness(wire, through(annotation(again)), photograph.size)))
     first = fits[0][1]
     return rows, [(wire.name, name, f'{value:.3g}', f'{lower:.3g} to {upper:.3g}',
                    f'{100 * (value / first - 1):+.1f} %') for name, value, lower, upper in fits], (
