@@ -111,7 +111,7 @@ def refine(setting: Setting, uniform: Fit, budget: int) -> Fit:
         bends = Rung('bends', _with_bends, aside=True)
         rungs = [*rungs[:1], bends, *rungs[1:], bends]
         why = ladder.climb(rungs)
-        if may_lock(space):
+        if may_lock(space) and not ladder.best.explained(level):
             why += ladder.instead(uniform, [partial(_with_locking, radius) for radius in BEGINNINGS], rungs,
                                   'locking', 'locks')
         knots = ladder.best.space.knots
@@ -119,15 +119,12 @@ def refine(setting: Setting, uniform: Fit, budget: int) -> Fit:
         words.append((f'rest shape with {knots} knots' if knots else 'straight') + at_clamps + why)
     even = ladder.best
     counts = [space.parts * 2**k for k in range(1, 4) if space.parts * 2**k <= MOST_PARTS]
-    halved = [Rung(str(count), partial(_with_parts, count)) for count in counts]
-    why = ladder.climb(halved[:2])
+    why = ladder.climb([Rung(str(count), partial(_with_parts, count)) for count in counts])
     beginnings: list[Finer] = [_with_smooth_stiffness]
     if ladder.best is not even:
         beginnings.append(partial(_as_smooth_as_parts, ladder.best, even))
-    smooth = '' if 'flexibility' not in space.free else ladder.instead(
+    smooth = '' if 'flexibility' not in space.free or even.explained(level) else ladder.instead(
         even, beginnings, (), 'a smooth stiffness', 'varies smoothly')
-    if ladder.best.space.parts > space.parts and halved[2:] and not ladder.over:
-        why = ladder.climb(halved[2:], shown=True)
     parts = ladder.best.space.parts
     words.append(f'{parts} part{"s" * (parts > 1)}' + why + smooth)
     return ladder.outcome('; '.join(words))
@@ -154,7 +151,7 @@ class _Ladder:
     def _spent(self) -> int:
         return sum(len(tried.evaluations) for tried in self._tried)
 
-    def climb(self, rungs: Iterable[Rung], shown: bool = False) -> str:
+    def climb(self, rungs: Iterable[Rung]) -> str:
         """
         Try rungs, each from the previous one, until two of them predict no better than the best.
 
@@ -162,10 +159,9 @@ class _Ladder:
         rung that is kept must predict significantly better.  Until then, one that predicts better in the mean
         alone is not kept, but is no failure; after it, that is enough.
 
-        :param shown: whether a rung before these was kept.
         :returns: why it ended, in words; empty if there is no finer rung.
         """
-        why, latest, missed = '', self.best, 0
+        why, latest, missed, shown = '', self.best, 0, False
         for rung in rungs:
             if self.best.explained(self._level):
                 break
@@ -208,14 +204,14 @@ class _Ladder:
         Climb a second time, from another beginning; keep where it leads if that predicts better.
 
         A DLO that locks has another rest shape, and one whose stiffness varies smoothly has no parts, so that
-        only the ends of both climbs can be compared.
+        only the ends of both climbs can be compared.  With fewer parameters, better in the mean is enough.
 
         :param coarse: the fit from which the second climb begins; it ends there if the beginnings that
             `finers` give do not lower the cost.
         :param name: what is tried, in words; `does`: what a DLO does to which it applies.
         :returns: the outcome in words; empty if it was not tried.
         """
-        if self.over or self.best.explained(self._level):
+        if self.over:
             return ''
         space, _ = finers[0](coarse.space, coarse.best.point)
         if self._budget - self._spent < 2 * space.dimension:
@@ -234,7 +230,9 @@ class _Ladder:
             self.best, self._best_errors = best, errors
             return f'; stopped before {name} was fitted' if isinstance(error, CancelledError) else \
                 f'; {name} could not be simulated'
-        if predicts_better(self._best_errors, errors):
+        fewer = self.best.space.dimension < best.space.dimension
+        if fewer and log_gains(self._best_errors, errors).mean() > 0 or \
+                predicts_better(self._best_errors, errors):
             return f'; it {does}'
         self.best, self._best_errors = best, errors
         return f'; {name} would not predict left-out trials better'

@@ -167,8 +167,9 @@ def with_outlier(setting: Setting, result: CalibrationResult) -> CalibrationResu
     if k is None or result.examination is None:
         return result
     others = replace(setting, trials=(*trials[:k], *trials[k + 1:]), on_evaluation=lambda _: None)
-    search = LeastSquares(space.dimension, setting.options.seed,
-                          Hints(point, result.examination.uncertainty.excited, upper=space.upper))
+    fine = space.knots > 0 or space.parts > 1  # what refinement has led to: from elsewhere, it is not found
+    search = LeastSquares(space.dimension, setting.options.seed, Hints(
+        point, result.examination.uncertainty.excited, refines=fine, coarse=fine, upper=space.upper))
     try:
         without = fit(others, space, search, budget(space.dimension)).best
         evaluation = setting.simulated(space, without)

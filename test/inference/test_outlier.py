@@ -223,7 +223,9 @@ def test_a_recording_that_the_others_do_not_predict_is_named_and_they_fit_better
     options = replace(session.options, engine='compiled', workers=2)
     result = calibrate(session.trials, options)
     assert result.outlier.trial == 'trial 8'
-    assert 'what the model does not know' in result.unusable
+    # The uncertainty of so many parameters may explain it: then the result is still of use.
+    assert 'trial 8 does not fit the others' in f'{result.unusable} {result.outlier_words}'
+    assert bool(result.unusable) != result.outlier.sensitive
     without = calibrate(session.trials[:7], options)
     assert not without.unusable
     assert without.errors.mean < 0.9 * result.errors.mean
