@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Sequence
 
 from dlo_calibration.calibration.options import AUTO, Options
-from dlo_calibration.model.parameters import LOCKING, PAPER_PARAMETERS, ParameterSpace
+from dlo_calibration.model.parameters import LOCKING, OWN_SHAPE, PAPER_PARAMETERS, ParameterSpace
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.excitation import motions
 from dlo_calibration.observation.grips import GripEvidence
@@ -61,6 +61,7 @@ def choose(trials: Sequence[Trial], options: Options, evidence: GripEvidence | N
             words += f' Corrected: {", ".join(errors)}, because {evidence.words(errors)}.'
     if options.evaluations == 0:
         ladders = chooses_parts(trials, options) * (1 + may_lock(options.space))
+        ladders += OWN_SHAPE in options.own
         rounds = budget(options.space.dimension) + REFINEMENT * ladders
         rounds += VALLEYS * (options.search == LeastSquares.name)
         options = replace(options, evaluations=rounds)

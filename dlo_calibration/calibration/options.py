@@ -27,6 +27,7 @@ from dlo_calibration.model.parameters import (
     MOST_PARTS,
     MOST_SESSIONS,
     own_name,
+    OWN_SHAPE,
     PAPER_PARAMETERS,
     PARAMETERS,
     ParameterSpace,
@@ -230,9 +231,10 @@ class Options(DeclaredOptions):
     own: tuple[str, ...] = declared(
         (), 'names of the parameters that differ from session to session, if several sessions of one DLO are '
         'calibrated together, e.g. friction on another table, or mass with another load; each session gets a '
-        'value of its own',
-        choices=tuple(name for name in BY_NAME
-                      if name not in (*PART_NAMES, *STIFFNESS_KNOTS, *REST_STATE)), of=SEARCH)
+        'value of its own; rest_shape: each session is a new grip by two clamps, and gets a rest shape of '
+        'its own if cross-validation shows that',
+        choices=(*(name for name in BY_NAME if name not in (*PART_NAMES, *STIFFNESS_KNOTS, *REST_STATE)),
+                 OWN_SHAPE), of=SEARCH)
     sessions: str = declared(
         '', 'numbers of trials of each of several sessions of one DLO, in their order, e.g. 4 3; fit with '
         'several sessions sets it; empty: all trials are of one session', of=OBSERVATION)
@@ -369,7 +371,7 @@ class Options(DeclaredOptions):
         space = ParameterSpace(self._names, {**values, **hands}, self.mass).divided(
             max(self.parts, named.parts)).shaped(named.knots or ParameterSpace(self._names, bent).knots)
         return replace(space, free=(*space.free, *(
-            own_name(name, session) for name in self.own
+            own_name(name, session) for name in self.own if name != OWN_SHAPE
             for session in range(2, len(self.trials_of_sessions) + 1))))
 
     @property

@@ -40,8 +40,12 @@ from dlo_calibration.model.parameters import (
     KNOTS,
     LOCKING,
     MOST_PARTS,
+    own_name,
+    OWN_SHAPE,
+    owner,
     ParameterSpace,
     PART_NAMES,
+    REST_SHAPE,
     STIFFNESS_KNOTS,
 )
 from dlo_calibration.model.trial import Trial
@@ -114,9 +118,16 @@ def refine(setting: Setting, uniform: Fit, budget: int) -> Fit:
         if may_lock(space) and not ladder.best.explained(level):
             why += ladder.instead(uniform, [partial(_with_locking, radius) for radius in BEGINNINGS], rungs,
                                   'locking', 'locks')
+        common, sessions, own = ladder.best, len(setting.options.trials_of_sessions), ''
+        if OWN_SHAPE in setting.options.own and sessions > 1:
+            rung = Rung('rest shapes of the sessions', partial(_with_own_shapes, sessions, twist))
+            own = ladder.climb([rung])
+            own = own if ladder.best is common else ', another one in each session'
         knots = ladder.best.space.knots
         at_clamps = ', bent at its clamps' if CLAMP_BENDS[0] in ladder.best.space.free else ''
-        words.append((f'rest shape with {knots} knots' if knots else 'straight') + at_clamps + why)
+        words.append((f'rest shape with {knots} knots' if knots else 'straight') + own + at_clamps + why)
+    elif OWN_SHAPE in setting.options.own:
+        words.append('no rest shape: only trials that all begin between two clamps show one')
     even = ladder.best
     counts = [space.parts * 2**k for k in range(1, 4) if space.parts * 2**k <= MOST_PARTS]
     why = ladder.climb([Rung(str(count), partial(_with_parts, count)) for count in counts])
@@ -324,6 +335,18 @@ def _with_bends(space: ParameterSpace, point: Floats) -> tuple[ParameterSpace, F
     return space.freed(CLAMP_BENDS, point) if space.knots else (space, point)
 
 
+def _with_own_shapes(sessions: int, twist: float, space: ParameterSpace, point: Floats
+                     ) -> tuple[ParameterSpace, Floats]:
+    """Begin with the same rest shape in all sessions."""
+    if not space.knots:
+        space, point = _with_knots(KNOTS[0], twist, space, point)
+    values = space.values(point)
+    own = {own_name(name, session): values[name] for session in range(2, sessions + 1)
+           for name in REST_SHAPE if name in values}
+    space = replace(space, free=(*space.free, *own))
+    return space, space.point({**values, **own})
+
+
 def _with_locking(radius: float, space: ParameterSpace, point: Floats) -> tuple[ParameterSpace, Floats]:
     locking, start = space.freed((LOCKING,), point)
     start[-1] = BY_NAME[LOCKING].coordinate(radius)
@@ -376,8 +399,8 @@ def _restated(evaluation: Evaluation, tried: ParameterSpace, space: ParameterSpa
         if names[0] in space.free:
             tried, point = tried.freed(names, point)
     values = tried.values(point)
-    return replace(evaluation, point=frozen_array(space.point(values)),
-                   values={name: values[name] for name in space.free})
+    values = {name: values.get(name, values[owner(name)[0]]) for name in space.free}
+    return replace(evaluation, point=frozen_array(space.point(values)), values=values)
 
 
 def _cost(fit: Fit, other: Fit) -> float:

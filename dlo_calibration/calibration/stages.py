@@ -40,7 +40,7 @@ from dlo_calibration.inference.outlier import candidate, is_outlier, Outlier, sp
 from dlo_calibration.inference.slices import simulate_slices, Slices
 from dlo_calibration.inference.uncertainty import DEVIATIONS, Uncertainty
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.model.parameters import BY_NAME, ParameterSpace, REST_STATE
+from dlo_calibration.model.parameters import BY_NAME, owner, ParameterSpace, REST_STATE
 from dlo_calibration.model.score import observed
 from dlo_calibration.observation.noise import NO_NOISE, noise, with_other_noise
 from dlo_calibration.observation.slow_errors import with_slow_errors
@@ -101,7 +101,7 @@ def _examined(setting: Setting, fit: Fit, discretised: bool) -> tuple[Examinatio
             best.point, best.residuals, ResidualLayout.compared(trials), evaluate.residuals,
             default=default, noise=sigma, finer=fine, starts=starts, hands=hands, slow=slow,
             restarted=[restart.residuals for restart in restarts],
-            fading=np.array([name not in REST_STATE for name in space.free]), upper=space.upper)
+            fading=np.array([owner(name)[0] not in REST_STATE for name in space.free]), upper=space.upper)
     finally:
         if finer is not None:
             finer.simulator.close()

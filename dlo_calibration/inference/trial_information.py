@@ -52,6 +52,7 @@ from dlo_calibration.model.parameters import (
     knot_names,
     KNOTS,
     measured,
+    owner,
     ParameterSpace,
     REST_STATE,
     SCALE,
@@ -402,7 +403,7 @@ class Appraiser:
         shift = optimum_shift(fit, fit.residuals + np.concatenate([model.finer for model in models]))
         starts = fit.residuals + np.hstack([model.moved for model in models])
         uncertainty = at_minimum(fit, layout, noise=self.noise, shift=shift, starts=starts)
-        fading = np.array([name not in REST_STATE for name in self.space.free])
+        fading = np.array([owner(name)[0] not in REST_STATE for name in self.space.free])
         return Appraisal(names, point, extended(
             fit, uncertainty, lambda points: self._residuals(trials, points), fading, shift), models)
 

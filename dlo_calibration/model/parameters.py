@@ -265,6 +265,7 @@ HANDS = ('hand_delay', 'hand_shift_x', 'hand_shift_y', 'hand_shift_z')
 REST_SHAPE = ('clamp_twist', *knot_names(KNOTS[-1]))
 #: How the DLO is when nothing bends it; only trials between two clamps show that.
 REST_STATE = (*REST_SHAPE, *CLAMP_BENDS)
+OWN_SHAPE = 'rest_shape'  # all of REST_SHAPE, where sessions have values of their own
 PAPER_PARAMETERS = ('flexibility', 'elasticity', 'friction', 'self_collision')
 SCALES = 2  # version of the scales in files; in the first, `flexibility` began at 0.1 N m^2
 _FIRST_FLEXIBILITY = replace(BY_NAME['flexibility'], at_zero=0.1)

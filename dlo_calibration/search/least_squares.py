@@ -275,12 +275,12 @@ class LeastSquares(Search):
         """Ask for start points until at least one can be simulated."""
         # Two per parameter and at least eight; a Sobol sequence is balanced only for powers of two.
         count = 2 ** int(np.ceil(np.log2(max(8, 2 * self._dimension))))
-        sobol = Sobol(self._dimension, self._seed)
         hint = np.clip(self._hints.start, 0, self._upper)
         if self._hints.refines:
             observations = yield hint[None, :]
             if observations[0].residuals is not None:
                 return list(observations)
+        sobol = Sobol(self._dimension, self._seed)
         while True:
             points = self._hints.spread(sobol.random(count))
             # Half of them have the prior estimate: a good one saves a lot, a wrong one spoils only half.

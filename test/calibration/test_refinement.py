@@ -27,8 +27,8 @@ REST_SHAPE = {'flexibility': 58.5, 'torsion': 60.0, 'clamp_twist': 52.0, **CURVA
 STRANDS = {'flexibility': 61.9231, 'torsion': 60.0, 'bending_friction': 45.0, 'bending_slip': 50.0}
 
 
-def calibrated(trials, budget=200, names=EVEN.free, parts=0, **rest):
-    options = Options(calibrate=names, evaluations=budget, parts=parts)
+def calibrated(trials, budget=200, names=EVEN.free, parts=0, own=(), sessions='', **rest):
+    options = Options(calibrate=names, evaluations=budget, parts=parts, own=own, sessions=sessions)
     return fitted(Setting(tuple(trials), options, CompiledSimulator(table=False, nodes=21), **rest))
 
 
@@ -51,7 +51,7 @@ def test_a_dlo_that_is_stiffer_in_the_middle_gets_four_parts(divided):
     for name, value in STIFF_MIDDLE.items():
         assert result.values[name] == pytest.approx(value, abs=1.5), name
     # Noise alone explains the rest.  A smooth stiffness has more parameters.
-    assert result.stop_reason.endswith('; 4 parts; a smooth stiffness would not predict left-out trials better')
+    assert '; 4 parts; a smooth stiffness would not' in result.stop_reason
     assert result.errors.mean < 2e-3
 
 
@@ -155,6 +155,45 @@ def test_a_dlo_whose_stiffness_varies_smoothly_is_found():
                    for physical in (result.physical(), space.physical(tapered, 1.0)))
     assert found[10:] == pytest.approx(true[10:], rel=0.05)  # what is in the first clamp hardly shows
     assert result.evaluations[0].values['stiffness_knot_5'] == 50  # of the even DLO
+
+
+@pytest.fixture(scope='module')
+def gripped():
+    """Two grips of a DLO, and what they show if it was curved otherwise in the second one."""
+    first = observed(CURVED, REST_SHAPE, sag=0.4)
+    other = {**REST_SHAPE, **{name: 100.0 - value for name, value in CURVATURES.items()}}
+
+    def sessions(shape):
+        again = observed(CURVED, shape, sag=0.4)
+        return *first, *(replace(trial, name=f'again {trial.name}', session=2) for trial in again)
+    return other, sessions(other), sessions(REST_SHAPE)
+
+
+@pytest.mark.long
+def test_a_dlo_that_changed_between_two_grips_has_a_rest_shape_in_each(gripped):
+    other, trials, _ = gripped
+    result = calibrated(trials, 600, CURVED.free[:2], own=('rest_shape',), sessions='4 4')
+    assert 'rest shape with 3 knots, another one in each session' in result.stop_reason
+    for shape, session in ((REST_SHAPE, ''), (other, '_session_2')):
+        for name in CURVATURES:
+            estimate = result.estimates[name + session]
+            assert estimate.lower <= shape[name] <= estimate.upper, name
+    together = calibrated(trials, 600, CURVED.free[:2])
+    assert result.errors.mean < 0.3 * together.errors.mean
+
+
+def test_sessions_without_clamps_have_no_rest_shape_and_the_outcome_says_so(stiff_middle):
+    again = [replace(trial, session=2) for trial in stiff_middle]
+    result = calibrated((*stiff_middle, *again), 60, own=('rest_shape',), sessions='4 4')
+    assert 'no rest shape: only trials that all begin between two clamps show one' in result.stop_reason
+
+
+@pytest.mark.long
+def test_a_dlo_that_is_the_same_in_two_grips_has_one_rest_shape(gripped):
+    *_, trials = gripped
+    result = calibrated(trials, 600, CURVED.free[:2], own=('rest_shape',), sessions='4 4')
+    assert 'in each session' not in result.stop_reason
+    assert set(result.space.free) == {'flexibility', 'torsion', 'clamp_twist', *CURVATURES}
 
 
 @pytest.mark.long
