@@ -60,8 +60,8 @@ def choose(trials: Sequence[Trial], options: Options, evidence: GripEvidence | N
             options = Options.of({**options.flat(), **errors})
             words += f' Corrected: {", ".join(errors)}, because {evidence.words(errors)}.'
     if options.evaluations == 0:
-        ladders = chooses_parts(trials, options) * (1 + may_lock(options.space))
-        ladders += OWN_SHAPE in options.own
+        ladders = chooses_parts(trials, options) * (
+            1 + may_lock(options.space) + (OWN_SHAPE in options.own))
         rounds = budget(options.space.dimension) + REFINEMENT * ladders
         rounds += VALLEYS * (options.search == LeastSquares.name)
         options = replace(options, evaluations=rounds)
