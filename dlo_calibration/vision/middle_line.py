@@ -331,7 +331,7 @@ def straighten(pixels: NDArray[np.uint8], line: Floats, half: Floats, offsets: F
     tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
     normals = np.column_stack([-tangents[:, 1], tangents[:, 0]])
     at = line[:, None] + (half[:, None] * offsets)[..., None] * normals[:, None]
-    low = np.maximum(np.floor(at.min(axis=(0, 1))).astype(int) - 2, 0)
+    low = np.clip(np.floor(at.min(axis=(0, 1))).astype(int) - 2, 0, np.array(pixels.shape[1::-1]) - 1)
     high = np.ceil(at.max(axis=(0, 1))).astype(int) + 3
     part = pixels[low[1]:max(high[1], low[1] + 1), low[0]:max(high[0], low[0] + 1)]
     return Strip(line, normals, half, offsets, colours_at(part, at - low))

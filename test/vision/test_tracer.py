@@ -14,7 +14,7 @@ from rendered_scenes import distances, scene
 
 from dlo_calibration.errors import InputError
 from dlo_calibration.vision import path
-from dlo_calibration.vision.middle_line import best_columns
+from dlo_calibration.vision.middle_line import best_columns, straighten
 from dlo_calibration.vision.tracer import Tracer
 
 SIZE = (1200, 900)  # px
@@ -157,6 +157,15 @@ def test_a_tiny_photograph_is_traced_or_refused(shape):
     except InputError:
         return
     assert np.isfinite(trace.pixels).all()
+
+
+@pytest.mark.parametrize('away', [(500.0, 0.0), (-500.0, 0.0), (0.0, 500.0), (0.0, -500.0)])
+def test_beside_the_picture_are_the_colours_of_its_edge(away):
+    pixels = np.full((30, 40, 3), (200, 30, 90), np.uint8)
+    line = np.column_stack([np.linspace(5, 35, 20), np.linspace(5, 25, 20)])
+    inside, beside = (straighten(pixels, points, np.ones(20), np.linspace(-1, 1, 5)).lab
+                      for points in (line, line + away))
+    assert beside == pytest.approx(inside)
 
 
 def test_a_straight_line_is_located_to_a_fraction_of_a_pixel():
