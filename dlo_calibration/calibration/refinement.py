@@ -134,8 +134,11 @@ def refine(setting: Setting, uniform: Fit, budget: int) -> Fit:
     beginnings: list[Finer] = [_with_smooth_stiffness]
     if ladder.best is not even:
         beginnings.append(partial(_as_smooth_as_parts, ladder.best, even))
-    smooth = '' if 'flexibility' not in space.free or even.explained(level) else ladder.instead(
-        even, beginnings, (), 'a smooth stiffness', 'varies smoothly')
+    # Where parts explain all but noise, only what has fewer parameters can be better.
+    fewer = len(STIFFNESS_KNOTS) + even.space.dimension < ladder.best.space.dimension
+    smooth = ''
+    if 'flexibility' in space.free and (fewer or not ladder.best.explained(level)):
+        smooth = ladder.instead(even, beginnings, (), 'a smooth stiffness', 'varies smoothly')
     parts = ladder.best.space.parts
     words.append(f'{parts} part{"s" * (parts > 1)}' + why + smooth)
     return ladder.outcome('; '.join(words))

@@ -50,8 +50,7 @@ def test_a_dlo_that_is_stiffer_in_the_middle_gets_four_parts(divided):
     assert result.space.parts == 4
     for name, value in STIFF_MIDDLE.items():
         assert result.values[name] == pytest.approx(value, abs=1.5), name
-    # Noise alone explains the rest.  A smooth stiffness has more parameters.
-    assert '; 4 parts; a smooth stiffness would not' in result.stop_reason
+    assert result.stop_reason.endswith('; 4 parts')  # noise alone explains the rest
     assert result.errors.mean < 2e-3
 
 
