@@ -82,7 +82,7 @@ class Rung:
 
 def refine(setting: Setting, uniform: Fit, budget: int) -> Fit:
     """
-    Add knots to the rest shape, also with locking, then halve all parts, while cross-validation improves.
+    Choose rest shape, locking, and how the stiffness varies, by cross-validation.
 
     Cross-validation predicts each trial from the others (Stone, Cross-validatory choice, 1974), so that
     what only fits noise is rejected. Nothing is tried if noise alone explains the residuals, in goals and
@@ -107,41 +107,50 @@ def refine(setting: Setting, uniform: Fit, budget: int) -> Fit:
     uniform = replace(uniform, model=model, validated=uniform.validated + STARTS)
     if uniform.explained(level):
         return uniform
-    ladder, words = _Ladder(setting, uniform, budget, level), []
-    if _shows_rest_shape(trials, space):
-        twist = clamp_twist(trials)
-        rungs = [Rung(str(knots), partial(_with_knots, knots, twist))
-                 for knots in KNOTS if knots > space.knots]
-        bends = Rung('bends', _with_bends, aside=True)
-        rungs = [*rungs[:1], bends, *rungs[1:], bends]
-        why = ladder.climb(rungs)
-        if may_lock(space) and not ladder.best.explained(level):
-            why += ladder.instead(uniform, [partial(_with_locking, radius) for radius in BEGINNINGS], rungs,
-                                  'locking', 'locks')
-        common, sessions, own = ladder.best, len(setting.options.trials_of_sessions), ''
-        if OWN_SHAPE in setting.options.own and sessions > 1:
-            rung = Rung('rest shapes of the sessions', partial(_with_own_shapes, sessions, twist))
-            own = ladder.climb([rung])
-            own = own if ladder.best is common else ', another one in each session'
-        knots = ladder.best.space.knots
-        at_clamps = ', bent at its clamps' if CLAMP_BENDS[0] in ladder.best.space.free else ''
-        words.append((f'rest shape with {knots} knots' if knots else 'straight') + own + at_clamps + why)
-    elif OWN_SHAPE in setting.options.own:
-        words.append('no rest shape: only trials that all begin between two clamps show one')
-    even = ladder.best
+    ladder = _Ladder(setting, uniform, budget, level)
+    words = [_choose_rest_shape(ladder, setting), _choose_stiffness(ladder)]
+    return ladder.outcome('; '.join(filter(None, words)))
+
+
+def _choose_rest_shape(ladder: _Ladder, setting: Setting) -> str:
+    """Climb to a rest shape, bends at the clamps and locking; return the outcome in words."""
+    uniform, options = ladder.best, setting.options
+    if not _shows_rest_shape(setting.trials, uniform.space):
+        return 'no rest shape: only trials that all begin between two clamps show one' \
+            if OWN_SHAPE in options.own else ''
+    twist, sessions = clamp_twist(setting.trials), len(options.trials_of_sessions)
+    rungs = [Rung(str(knots), partial(_with_knots, knots, twist))
+             for knots in KNOTS if knots > uniform.space.knots]
+    bends = Rung('bends', _with_bends, aside=True)
+    rungs = [*rungs[:1], bends, *rungs[1:], bends]
+    why = ladder.climb(rungs)
+    if may_lock(uniform.space) and not ladder.explained:
+        why += ladder.instead(uniform, [partial(_with_locking, radius) for radius in BEGINNINGS], rungs,
+                              'locking', 'locks')
+    common, in_each = ladder.best, ''
+    if OWN_SHAPE in options.own and sessions > 1:
+        none = ladder.climb([Rung('another one in each session', partial(_with_own_shapes, sessions, twist))])
+        why += none.replace(':', ';', 1)
+        in_each = '' if ladder.best is common else ', another one in each session'
+    space = ladder.best.space
+    at_clamps = ', bent at its clamps' if CLAMP_BENDS[0] in space.free else ''
+    return (f'rest shape with {space.knots} knots' if space.knots else 'straight') + in_each + at_clamps + why
+
+
+def _choose_stiffness(ladder: _Ladder) -> str:
+    """Climb to parts of different stiffness, or one that varies smoothly; return the outcome in words."""
+    even, space = ladder.best, ladder.best.space
     counts = [space.parts * 2**k for k in range(1, 4) if space.parts * 2**k <= MOST_PARTS]
     why = ladder.climb([Rung(str(count), partial(_with_parts, count)) for count in counts])
     beginnings: list[Finer] = [_with_smooth_stiffness]
     if ladder.best is not even:
         beginnings.append(partial(_as_smooth_as_parts, ladder.best, even))
     # Where parts explain all but noise, only what has fewer parameters can be better.
-    fewer = len(STIFFNESS_KNOTS) + even.space.dimension < ladder.best.space.dimension
-    smooth = ''
-    if 'flexibility' in space.free and (fewer or not ladder.best.explained(level)):
-        smooth = ladder.instead(even, beginnings, (), 'a smooth stiffness', 'varies smoothly')
+    fewer = space.dimension + len(STIFFNESS_KNOTS) < ladder.best.space.dimension
+    if 'flexibility' in space.free and (fewer or not ladder.explained):
+        why += ladder.instead(even, beginnings, (), 'a smooth stiffness', 'varies smoothly')
     parts = ladder.best.space.parts
-    words.append(f'{parts} part{"s" * (parts > 1)}' + why + smooth)
-    return ladder.outcome('; '.join(words))
+    return f'{parts} part{"s" * (parts > 1)}' + why
 
 
 class _Ladder:
@@ -150,7 +159,7 @@ class _Ladder:
 
     :ivar best: the best fit so far; every fit that is tried has its linear model.
     :ivar over: whether it was stopped, or its budget is too small for more; then it tries nothing else.
-    :param level: of noise [m], with what it does at the start; it tries nothing if that explains a fit.
+    :param level: of noise [m], with what it does at the start; it climbs no further if that explains a fit.
     """
 
     def __init__(self, setting: Setting, best: Fit, budget: int, level: float) -> None:
@@ -160,6 +169,11 @@ class _Ladder:
         self._layout = ResidualLayout.compared(setting.trials)
         self._tried = [best]
         self._simulated = best.validated  # parameter sets, beside those of the searches
+
+    @property
+    def explained(self) -> bool:
+        """Whether noise alone explains the best fit."""
+        return self.best.explained(self._level)
 
     @property
     def _spent(self) -> int:
@@ -177,7 +191,7 @@ class _Ladder:
         """
         why, latest, missed, shown = '', self.best, 0, False
         for rung in rungs:
-            if self.best.explained(self._level):
+            if self.explained:
                 break
             space, _ = rung.finer(latest.space, latest.best.point)
             if space == latest.space:

@@ -167,7 +167,8 @@ def with_outlier(setting: Setting, result: CalibrationResult) -> CalibrationResu
     if k is None or result.examination is None:
         return result
     others = replace(setting, trials=(*trials[:k], *trials[k + 1:]), on_evaluation=lambda _: None)
-    fine = space.knots > 0 or space.parts > 1  # what refinement has led to: from elsewhere, it is not found
+    # A DLO with knots or parts was found from coarser ones; its search begins only where that ended.
+    fine = space.knots > 0 or space.parts > 1
     search = LeastSquares(space.dimension, setting.options.seed, Hints(
         point, result.examination.uncertainty.excited, refines=fine, coarse=fine, upper=space.upper))
     try:

@@ -187,14 +187,14 @@ def _about_vertical(orientations: Floats, sights: Floats, pictures: NDArray[np.i
 
     turned = np.full_like(orientations, np.nan)
     known = np.isfinite(orientations[:, 0]) & np.isfinite(sights[:, 0])
-    seen, count = Rotation.from_quat(orientations[known]), np.cumsum(known) - 1
+    seen, moving = Rotation.from_quat(orientations[known]), np.isin(np.flatnonzero(known), pictures)
     sight = sights[known]
     sight = sight / np.maximum(sight[:, 2:], LOW * np.linalg.norm(sight, axis=1, keepdims=True))
     matrices = seen.as_matrix()
     yaw = np.unwrap(np.arctan2(matrices[:, 1, 0] - matrices[:, 0, 1], matrices[:, 0, 0] + matrices[:, 1, 1]))
     for _ in range(ROUNDS):
         about = Rotation.from_rotvec(yaw[:, None] * [0.0, 0.0, 1.0])
-        tilt = (about.inv() * seen)[count[pictures[known[pictures]]]].mean()
+        tilt = (about.inv() * seen)[moving].mean()
         away = (seen * (about * tilt).inv()).as_rotvec()
         yaw = yaw + (away * sight).sum(axis=1)
     turned[known] = (Rotation.from_rotvec(yaw[:, None] * [0.0, 0.0, 1.0]) * tilt).as_quat()
