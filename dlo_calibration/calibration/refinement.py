@@ -60,7 +60,7 @@ STARTS = 4  # of each trial, with other noise
 LEAST_SHARE = 0.04  # of the cost: new parameters that explain less cannot lower the error by 2 %
 BEGINNINGS = (0.03, 0.1, 0.3)  # m; bend radii from the best of which a search of locking begins
 
-#: Returns a finer space, and its point for the same DLO.
+#: Returns a finer space, and its point for the same DLO, which may lie outside the box; a linear map.
 Finer = Callable[[ParameterSpace, Floats], tuple[ParameterSpace, Floats]]
 
 
@@ -306,6 +306,7 @@ class _Ladder:
         old = [int(np.flatnonzero((np.abs(nested - unit) < 1e-9).all(axis=1))[0]) for unit in units]
         new = np.setdiff1d(np.arange(space.dimension), old)
         self._simulated += 1 + len(new)
+        start = np.clip(start, 0, space.upper)
         model = _linearised(self._setting, space, start, new)  # of new parameters only
         jacobian = model.jacobian.copy()
         jacobian[:, old] = coarse.model.jacobian - jacobian[:, new] @ nested[new]
@@ -389,7 +390,7 @@ def _as_smooth_as_parts(parts: Fit, even: Fit, space: ParameterSpace, point: Flo
                            - even.best.point[flexibility])
     for name, ratio in zip(STIFFNESS_KNOTS, knots[1:] / knots[0], strict=True):
         start[smooth.free.index(name)] = BY_NAME[name].coordinate(ratio)
-    return smooth, np.clip(start, 0, smooth.upper)
+    return smooth, start
 
 
 def _with_parts(count: int, space: ParameterSpace, point: Floats) -> tuple[ParameterSpace, Floats]:

@@ -24,6 +24,10 @@ CURVATURES = {'rest_curvature_x1': 56.0, 'rest_curvature_y1': 47.0, 'rest_curvat
               'rest_curvature_y2': 54.0, 'rest_curvature_x3': 46.0, 'rest_curvature_y3': 44.0}
 REST_SHAPE = {'flexibility': 58.5, 'torsion': 60.0, 'clamp_twist': 52.0, **CURVATURES}
 
+TAPERED = {**TRUTH, 'stiffness_knot_2': 56.0, 'stiffness_knot_3': 62.0, 'stiffness_knot_4': 70.0,
+           'stiffness_knot_5': 76.0}
+SMOOTH = ParameterSpace(tuple(TAPERED))
+
 STRANDS = {'flexibility': 61.9231, 'torsion': 60.0, 'bending_friction': 45.0, 'bending_slip': 50.0}
 
 
@@ -145,15 +149,19 @@ def test_a_dlo_that_stands_askew_in_its_clamps_is_found():
 
 @pytest.mark.long
 def test_a_dlo_whose_stiffness_varies_smoothly_is_found():
-    tapered = {**TRUTH, 'stiffness_knot_2': 56.0, 'stiffness_knot_3': 62.0, 'stiffness_knot_4': 70.0,
-               'stiffness_knot_5': 76.0}
-    space = ParameterSpace(tuple(tapered))
-    result = calibrated(observed(space, tapered))
+    result = calibrated(observed(SMOOTH, TAPERED))
     assert result.stop_reason.endswith('; it varies smoothly')
     found, true = (physical['flexibility'] * stiffness_profile(physical)
-                   for physical in (result.physical(), space.physical(tapered, 1.0)))
+                   for physical in (result.physical(), SMOOTH.physical(TAPERED, 1.0)))
     assert found[10:] == pytest.approx(true[10:], rel=0.05)  # what is in the first clamp hardly shows
     assert result.evaluations[0].values['stiffness_knot_5'] == 50  # of the even DLO
+
+
+@pytest.mark.long
+def test_stiffness_is_chosen_where_another_parameter_is_at_the_end_of_its_scale():
+    result = calibrated(observed(SMOOTH, {**TAPERED, 'damping': 102.0}))
+    assert result.values['damping'] == 100
+    assert '8 parts' in result.stop_reason
 
 
 @pytest.fixture(scope='module')
