@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Sequence
 
 from dlo_calibration.calibration.options import AUTO, Options
+from dlo_calibration.errors import InputError
 from dlo_calibration.model.parameters import LOCKING, OWN_SHAPE, PAPER_PARAMETERS, ParameterSpace
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.excitation import motions
@@ -48,6 +49,7 @@ def choose(trials: Sequence[Trial], options: Options, evidence: GripEvidence | N
     The same trials and options give the same choice. Options that leave nothing open do not change.
 
     :param evidence: what the trials show of the hands, if it is known already.
+    :raises InputError: if nothing would choose whether sessions have rest shapes of their own.
     """
     words, errors = '', dict[str, float]()
     if options.calibrate == (AUTO,):
@@ -59,6 +61,10 @@ def choose(trials: Sequence[Trial], options: Options, evidence: GripEvidence | N
         if errors:
             options = Options.of({**options.flat(), **errors})
             words += f' Corrected: {", ".join(errors)}, because {evidence.words(errors)}.'
+    if OWN_SHAPE in options.own and not chooses_parts(trials, options):
+        raise InputError('own', f'{OWN_SHAPE}, which cross-validation of several trials chooses',
+                         f'search {LeastSquares.name}, parts 0, and flexibility among the parameters to find',
+                         f'change these options, or leave {OWN_SHAPE} out')
     if options.evaluations == 0:
         ladders = chooses_parts(trials, options) * (
             1 + may_lock(options.space) + (OWN_SHAPE in options.own))

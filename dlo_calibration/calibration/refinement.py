@@ -97,8 +97,11 @@ def refine(setting: Setting, uniform: Fit, budget: int) -> Fit:
     :returns: `uniform` if nothing was tried.
     """
     space, trials = uniform.space, setting.trials
-    if uniform.stopped or uniform.explained(noise(trials)):
+    words = 'one rest shape: noise alone explains the residuals' if OWN_SHAPE in setting.options.own else ''
+    if uniform.stopped:
         return uniform
+    if uniform.explained(noise(trials)):
+        return replace(uniform, parts=words)
     try:  # the best point may have no model
         model = uniform.model or _linearised(setting, space, uniform.best.point, np.arange(space.dimension))
         level = math.hypot(noise(trials), _effect_of_starts(setting, uniform))
@@ -106,10 +109,10 @@ def refine(setting: Setting, uniform: Fit, budget: int) -> Fit:
         return uniform
     uniform = replace(uniform, model=model, validated=uniform.validated + STARTS)
     if uniform.explained(level):
-        return uniform
+        return replace(uniform, parts=words)
     ladder = _Ladder(setting, uniform, budget, level)
-    words = [_choose_rest_shape(ladder, setting), _choose_stiffness(ladder)]
-    return ladder.outcome('; '.join(filter(None, words)))
+    chosen = [_choose_rest_shape(ladder, setting), _choose_stiffness(ladder)]
+    return ladder.outcome('; '.join(filter(None, chosen)))
 
 
 def _choose_rest_shape(ladder: _Ladder, setting: Setting) -> str:

@@ -10,6 +10,7 @@ from carried_trials import EVEN, observed, POINTS, STIFF_MIDDLE, TRUTH
 import numpy as np
 import pytest
 
+from dlo_calibration import InputError
 from dlo_calibration.calibration.calibrate import fitted
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.refinement import _Ladder, Rung
@@ -193,6 +194,17 @@ def test_sessions_without_clamps_have_no_rest_shape_and_the_outcome_says_so(stif
     again = [replace(trial, session=2) for trial in stiff_middle]
     result = calibrated((*stiff_middle, *again), 60, own=('rest_shape',), sessions='4 4')
     assert 'no rest shape: only trials that all begin between two clamps show one' in result.stop_reason
+
+
+@pytest.mark.parametrize('option', [{'parts': 1}, {'names': ('damping',)}])
+def test_rest_shapes_of_sessions_that_nothing_would_choose_are_refused(stiff_middle, option):
+    with pytest.raises(InputError, match='own: rest_shape.*expected search least_squares'):
+        calibrated(stiff_middle, 60, own=('rest_shape',), sessions='2 2', **option)
+
+
+def test_the_outcome_says_that_noise_explains_what_rest_shapes_might():
+    result = calibrated(observed(EVEN, TRUTH), own=('rest_shape',), sessions='2 2')
+    assert result.stop_reason.endswith('; one rest shape: noise alone explains the residuals')
 
 
 @pytest.mark.long
