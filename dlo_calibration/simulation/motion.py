@@ -46,18 +46,22 @@ def hands_at(trial: Trial, time: float) -> dict[str, tuple[Floats, bool]]:
     return {name: (hand.positions_at(time)[0], name in holding) for name, hand in current.items()}
 
 
-def densely(trial: Trial, frames: int = MOST_FRAMES) -> Trial:
+def densely(trial: Trial) -> Trial:
     """Return a trial with additional timed goals, one for each frame; their chains are placeholders."""
-    last = max(max(hand.end for hand in trial.hands) + 1.0, trial.goals[-1].time)
     times = {goal.time for goal in trial.goals}
-    count = min(frames, max(2, round(last * FRAME_RATE) + 1))
     added = []
-    for time in np.linspace(0.0, last, count):
-        if float(time) not in times:
+    for time in _frame_times(trial):
+        if time not in times:
             # Between two goals, the hands that hold are those of the later goal, as in the trial itself.
             following = next((goal for goal in trial.goals if goal.time > time), trial.goals[-1])
-            added.append(Goal(trial.initial, float(time), stable=False, held_by=following.held_by))
+            added.append(Goal(trial.initial, time, stable=False, held_by=following.held_by))
     return replace(trial, goals=(*trial.goals, *added))
+
+
+def _frame_times(trial: Trial) -> list[float]:
+    last = max(max(hand.end for hand in trial.hands) + 1.0, trial.goals[-1].time)
+    count = min(MOST_FRAMES, max(2, round(last * FRAME_RATE) + 1))
+    return [float(time) for time in np.linspace(0.0, last, count)]
 
 
 def simulated_motion(trial: Trial, simulator: Simulator, physical: Mapping[str, float]) -> Motion:
@@ -72,5 +76,6 @@ def simulated_motion(trial: Trial, simulator: Simulator, physical: Mapping[str, 
     observed = {id(goal.chain) for goal in trial.goals}
     ends = [k for k, goal in enumerate(dense.goals) if id(goal.chain) in observed]
     # A stable goal is simulated until the DLO rests, which is later than its time.
-    frames = [k for k, goal in enumerate(dense.goals) if not goal.stable]
+    times = _frame_times(trial)
+    frames = [k for k, goal in enumerate(dense.goals) if not goal.stable and goal.time in times]
     return Motion(np.array([dense.goals[k].time for k in frames]), chains[frames], chains[ends])

@@ -196,6 +196,14 @@ def test_motion_has_the_simulated_chains_over_time_and_those_at_the_goals():
     assert np.allclose(motion.ends[:, :, 2] - trial.initial.points[:, 2], 9.0)
 
 
+def test_motion_of_a_trial_with_a_hundred_goals_a_second_has_ten_frames_a_second():
+    trial, = toy_trials(1)
+    goals = [replace(trial.goals[0], time=k / 100, stable=False) for k in range(1, 401)]
+    motion = simulated_motion(replace(trial, goals=tuple(goals)), Following(), {})
+    assert np.allclose(motion.times, np.arange(41) / 10)
+    assert len(motion.ends) == 400
+
+
 @pytest.mark.parametrize('held_by', [(), ('left_hand',)])
 def test_instants_between_change_nothing_of_the_course(held_by):
     def followed(trial):
