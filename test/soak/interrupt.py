@@ -205,7 +205,7 @@ def unfinished(folder: Path) -> list[str]:
                     image.load()
             elif path.suffix == '.json':
                 json.loads(octets)
-            elif not octets.endswith(b'\n'):
+            elif not octets.endswith((b'\n', b'</svg>')):
                 raise ValueError('cut')
         except (InputError, McapError, ValueError, OSError) as error:
             found.append(f'{path.relative_to(folder)}: {error}')
