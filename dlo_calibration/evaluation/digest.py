@@ -38,14 +38,19 @@ def code_digest(rooms: tuple[str, ...]) -> str:
 
 def file_digests(paths: Iterable[Path]) -> dict[str, str]:
     """
-    Return the SHA-256 of files, as `sha256sum` prints it, by file name without folders.
+    Return the SHA-256 of files, as `sha256sum` prints it, by file name.
+
+    A name has no folders but those that distinguish it from the names before.
 
     :raises OSError: if a file cannot be read.
     """
-    digests = {}
+    digests: dict[str, str] = {}
     for path in paths:
+        parts = path.absolute().parts
+        names = ('/'.join(parts[-count:]) for count in range(1, len(parts)))
         with path.open('rb') as stream:
-            digests[path.name] = file_digest(stream, 'sha256').hexdigest()
+            digests[next(name for name in names if name not in digests)] = \
+                file_digest(stream, 'sha256').hexdigest()
     return digests
 
 

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 import json
 from pathlib import Path
 import shutil
@@ -45,18 +45,21 @@ class LogHead:
     :param namespace: of the topics; None: the session has only one.
     :param options: without those of the machine.
     :param without: numbers of the trials that are left out.
+    :param sessions: the SHA-256 of each recorded file, by its name.
     """
 
     digest: str
     namespace: str | None
     options: Mapping[str, Any]
     without: tuple[int, ...] = ()
+    sessions: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def of(cls, source: Source) -> LogHead:
         """Return the head of a calibration that begins."""
+        files = [file for part in source.parts or (source,) for file in recorded_files(part.path)]
         return cls(calibration_digest(source.trials, source.options), source.namespace,
-                   recordable(source.options.flat()), source.selection.without)
+                   recordable(source.options.flat()), source.selection.without, file_digests(files))
 
     @classmethod
     def read(cls, log: EvaluationLog) -> LogHead | None:
@@ -67,7 +70,8 @@ class LogHead:
         try:
             head = cls(**json.loads(entry.text))
             return cls(str(head.digest), head.namespace and str(head.namespace),
-                       Options.of(head.options).flat(), tuple(int(number) for number in head.without))
+                       Options.of(head.options).flat(), tuple(int(number) for number in head.without),
+                       {str(name): str(sha256) for name, sha256 in head.sessions.items()})
         except (ValueError, TypeError, AttributeError, RecursionError, InputError):  # a stranger's
             return None
 
@@ -88,6 +92,7 @@ class CalibrationFolder:
         make_folder(path)  # fails before hours are spent on a search
         self.path, self._unfinished = path, path / UNFINISHED
         self._source: Source | None = None
+        self._sessions: Mapping[str, str] = {}
         try:
             if self._unfinished.is_symlink():
                 raise OSError('it is a link')
@@ -154,6 +159,7 @@ class CalibrationFolder:
             self._opened_log, self._new, before = EvaluationLog(self._unfinished / LOG), True, None
         if self._opened_log.evaluations:
             warn(self._opened_log.resumed)
+        self._sessions = (before or head).sessions
         if before is None:
             try:
                 if source.request is not None:
@@ -193,9 +199,8 @@ class CalibrationFolder:
         source, attempts = self._source, Attempts(self.path)
         parts = source.parts or (source,)
         stamps = [record.log_time * 1e-9 for part in parts for record in part.session.inputs]
-        files = [file for part in parts for file in recorded_files(part.path)]
         write_values(attempts, result, source.options, Passport.new(
-            source.options.measured_by, min(stamps, default=0.0), file_digests(files)))
+            source.options.measured_by, min(stamps, default=0.0), self._sessions))
         with attempts.attempt(SESSION):
             _write_session(source, self.path / SESSION)
         if source.request is not None:

@@ -4,6 +4,7 @@
 """Several sessions of one DLO, calibrated together, with parameters that differ from session to session."""
 
 from dataclasses import replace
+from hashlib import sha256
 import json
 
 import numpy as np
@@ -53,6 +54,17 @@ def test_each_session_gets_a_value_of_its_own(fit, sessions):
     found = {name: parameter['value'] for name, parameter in printed['parameters'].items()}
     assert found == pytest.approx(
         {**TRUTH, 'friction_session_2': 50.0, 'friction_session_3': 60.0}, abs=0.5)
+
+
+def test_the_passport_names_all_sessions_also_those_whose_files_have_the_same_name(fit, sessions, tmp_path):
+    paths = [tmp_path / name / 'session.mcap' for name in ('first', 'second')]
+    for path, session in zip(paths, sessions, strict=False):
+        path.parent.mkdir()
+        path.write_bytes(session.read_bytes())
+    assert fit(*paths, '--evaluations', '8', '--output', tmp_path / 'out')[0] == 0
+    assert read_result(tmp_path / 'out' / 'result.xml').passport.sessions == {
+        name: sha256(path.read_bytes()).hexdigest()
+        for name, path in zip(('session.mcap', 'second/session.mcap'), paths, strict=True)}
 
 
 @pytest.mark.long
