@@ -100,7 +100,9 @@ def of_fit(folder: Path, tally: Tally, choose: random.Random, choice: dict[str, 
     while True:
         here = choose.choice((1, 1, workers))
         limit = choose.uniform(0.2, 1.0) * whole.seconds if kills < most else None
-        begun = any((out / name).exists() for name in ('unfinished/evaluations.log', 'result.xml'))
+        # What is killed before it has written anything begins anew.
+        begun = any((out / name).exists() and (out / name).stat().st_size
+                    for name in ('unfinished/evaluations.log', 'result.xml'))
         again = ('fit', '--resume', out, '--json', '--workers', here)
         life = live(folder, *(again if begun else (*words, here, '--output', out)), limit=limit)
         tally.tried += 1
