@@ -32,6 +32,7 @@ from dlo_calibration.messages.codec import bag_types
 FULL = 14
 PATIENCE = 120.0  # s that a process may take
 MOST = 4  # kills of one calibration
+REPEATED = 1  # evaluation: a search that goes on begins where it was, and a log has each point once
 SMALL = {'nodes': 12, 'time_step': 0.01, 'settle_limit': 0.3}
 #: What is calibrated in turn; `compiled` is the toy, see `counted_command`.
 CHOICES: tuple[dict[str, Any], ...] = (
@@ -108,7 +109,7 @@ def of_fit(folder: Path, tally: Tally, choose: random.Random, choice: dict[str, 
         tally.tried += 1
         tally.remember(peak=life.peak, silence=0.0)
         finished = 'nothing to resume' in life.err  # the kill before hit a process that had done all
-        if told > life.found and (life.told or life.code == 0) and not finished:
+        if told > life.found + REPEATED and (life.told or life.code == 0) and not finished:
             report(tally, f'{choice}: {told} evaluations were told, and {life.found} found')
         told, simulations = max(told, life.told), simulations + life.simulations
         if life.code != -signal.SIGKILL or limit is None:
@@ -199,7 +200,7 @@ def of_node(folder: Path, tally: Tally, choose: random.Random) -> None:
             results.append(robot.until_result())
             found = max((int(number) for detail in details(robot.heard['status']) for number in
                          re.findall('goes on after ([0-9]+) evaluations', detail)), default=0)
-            if told > found:
+            if told > found + REPEATED:
                 report(tally, f'node: {told} evaluations were told, and {found} found')
             told = 0
             if list((folder / out).glob('dlo_unfinished_*')):
