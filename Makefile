@@ -53,7 +53,7 @@ help:
 	  make lint    run the checks of style, types, imports and packaging alone
 	  make sanitize   run the tests of the engines with a core that checks its memory and its arithmetic
 	  make aarch64    compile the core for ARM, with Zig of PyPI
-	  make bench   measure speed, memory, start-up and accuracy, and compare the engines: about 25 minutes
+	  make bench   measure speed, memory, start-up and accuracy, and compare the engines: about 35 minutes
 	  make soak    run long tests, draw many random examples, try hostile input and faults: an hour or more
 	  make figures make all tables of benchmark/results: make bench, and then some hours
 	  make clean   remove .venv and everything that was built

@@ -4,7 +4,7 @@
 """
 Measure the accuracy of `fit` on known objects and on measured cables, with the commands of a user.
 
-    python benchmark/accuracy.py [reference] [mocap] [hanging] [--search NAME] [--evaluations N] [--seed S]
+    python benchmark/accuracy.py [TABLE ...] [--search NAME] [--evaluations N] [--seed S]
 
 `dlo-calibration fit` and `validate` print each figure, for sessions that convert.py
 makes; this program computes only means, and medians over trials: a few recordings are chaotic, so that
@@ -27,9 +27,11 @@ import numpy as np
 HERE = Path(__file__).resolve().parent
 COMMAND = [sys.executable, '-m', 'dlo_calibration']
 MOCAP_FIT = '0,8,16,24,32,40,48,54'  # spread over the session, because the choice matters
+#: Other recordings that a user might have made.
+MOCAP_AGAIN = ('2,10,18,26,34,42,50,55', '5,13,21,28,37,45,51,53', '1,12,22,31,38,46,49,52')
 MOCAP_OTHER = '42,43,44,45,46,47,49,50,51,52,53,55'
-MOCAP_ALL = ','.join(str(index) for index in range(56) if str(index) not in MOCAP_FIT.split(','))
 WIRE = 1.5  # m
+CABLES = ('dlo1', 'dlo2', 'dlo3')
 ENVIRONMENT = {**os.environ, 'PYTHONPATH': str(HERE.parent)}
 
 
@@ -108,15 +110,37 @@ def reference(folder: Path, options: list[str]) -> str:
 def mocap(folder: Path, options: list[str]) -> str:
     """Tabulate three cables: fitted on 8 recordings, judged on 12 others and on all 48 others."""
     parts = []
-    for cable in ('dlo1', 'dlo2', 'dlo3'):
+    for cable in CABLES:
         session = convert('mocap', cable, folder / cable, '--recordings', MOCAP_FIT)
         fitted = fit(session, folder / f'{cable}_fit', *options)
         judged = {'fitted': (session, fitted)}
-        for name, chosen in (('12 others', MOCAP_OTHER), ('all others', MOCAP_ALL)):
+        for name, chosen in (('12 others', MOCAP_OTHER), ('all others', all_but(MOCAP_FIT))):
             unseen = convert('mocap', cable, folder / f'{cable}_{name}', '--recordings', chosen)
             judged[name] = unseen, validate(folder / f'{cable}_fit', unseen)
         parts.append(f'## {cable}\n\n{table("recordings", folder / f"{cable}_fit", judged)}')
     return '\n\n'.join(parts)
+
+
+def mocap_again(folder: Path, options: list[str]) -> str:
+    """Tabulate the three cables, fitted on other choices of 8 recordings, judged on all others."""
+    rows = ['| cable | recordings | fitted mean_abs_error_m | that of all others | its median over them '
+            '| seconds |', '|' + '---|' * 6]
+    for cable in CABLES:
+        for k, chosen in enumerate(MOCAP_AGAIN):
+            result = folder / f'{cable}_{k}_fit'
+            session = convert('mocap', cable, folder / f'{cable}_{k}', '--recordings', chosen)
+            fitted = fit(session, result, *options)
+            unseen = convert('mocap', cable, folder / f'{cable}_{k}_others', '--recordings', all_but(chosen))
+            errors = (fitted['mean_abs_error_m'], validate(result, unseen)['mean_abs_error_m'],
+                      median(result, unseen))
+            rows.append(f'| {cable} | {chosen} | ' + ' | '.join(f'{error:.5f}' for error in errors)
+                        + f' | {fitted["seconds"]:.0f} |')
+    return '\n'.join(rows)
+
+
+def all_but(chosen: str) -> str:
+    """Return the recordings of a cable that are not chosen."""
+    return ','.join(str(index) for index in range(56) if str(index) not in chosen.split(','))
 
 
 def hanging(folder: Path, options: list[str]) -> str:
@@ -167,7 +191,7 @@ def table(what: str, result: Path, judged: dict[str, tuple[Path, dict[str, Any]]
     return '\n'.join(rows)
 
 
-TABLES = {'reference': reference, 'mocap': mocap, 'hanging': hanging}
+TABLES = {'reference': reference, 'mocap': mocap, 'hanging': hanging, 'mocap_again': mocap_again}
 
 
 def main() -> None:
