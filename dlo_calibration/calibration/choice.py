@@ -62,7 +62,7 @@ def choose(trials: Sequence[Trial], options: Options, evidence: GripEvidence | N
             options = Options.of({**options.flat(), **errors})
             words += f' Corrected: {", ".join(errors)}, because {evidence.words(errors)}.'
     if OWN_SHAPE in options.own and not chooses_parts(trials, options):
-        raise InputError('own', f'{OWN_SHAPE}, which cross-validation of several trials chooses',
+        raise InputError('parameter own', f'{OWN_SHAPE}, which cross-validation of several trials chooses',
                          f'search {LeastSquares.name}, parts 0, and flexibility among the parameters to find',
                          f'change these options, or leave {OWN_SHAPE} out')
     if options.evaluations == 0:

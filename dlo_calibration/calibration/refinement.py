@@ -94,14 +94,14 @@ def refine(setting: Setting, uniform: Fit, budget: int) -> Fit:
 
     :param uniform: the fit of the uniform DLO.
     :param budget: largest number of evaluations of all searches, including those of `uniform`.
-    :returns: `uniform` if nothing was tried.
+    :returns: `uniform` if nothing was tried; if rest shapes were asked for, it says why.
     """
     space, trials = uniform.space, setting.trials
-    words = 'one rest shape: noise alone explains the residuals' if OWN_SHAPE in setting.options.own else ''
+    why = 'one rest shape: noise alone explains the residuals' if OWN_SHAPE in setting.options.own else ''
     if uniform.stopped:
         return uniform
     if uniform.explained(noise(trials)):
-        return replace(uniform, parts=words)
+        return replace(uniform, parts=why)
     try:  # the best point may have no model
         model = uniform.model or _linearised(setting, space, uniform.best.point, np.arange(space.dimension))
         level = math.hypot(noise(trials), _effect_of_starts(setting, uniform))
@@ -109,10 +109,10 @@ def refine(setting: Setting, uniform: Fit, budget: int) -> Fit:
         return uniform
     uniform = replace(uniform, model=model, validated=uniform.validated + STARTS)
     if uniform.explained(level):
-        return replace(uniform, parts=words)
+        return replace(uniform, parts=why)
     ladder = _Ladder(setting, uniform, budget, level)
-    chosen = [_choose_rest_shape(ladder, setting), _choose_stiffness(ladder)]
-    return ladder.outcome('; '.join(filter(None, chosen)))
+    words = [_choose_rest_shape(ladder, setting), _choose_stiffness(ladder)]
+    return ladder.outcome('; '.join(filter(None, words)))
 
 
 def _choose_rest_shape(ladder: _Ladder, setting: Setting) -> str:

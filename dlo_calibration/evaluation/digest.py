@@ -40,17 +40,18 @@ def file_digests(paths: Iterable[Path]) -> dict[str, str]:
     """
     Return the SHA-256 of files, as `sha256sum` prints it, by file name.
 
-    A name has no folders but those that distinguish it from the names before.
+    A name has no folders but those that distinguish it from the name of another file.
 
     :raises OSError: if a file cannot be read.
     """
     digests: dict[str, str] = {}
     for path in paths:
-        parts = path.absolute().parts
-        names = ('/'.join(parts[-count:]) for count in range(1, len(parts)))
         with path.open('rb') as stream:
-            digests[next(name for name in names if name not in digests)] = \
-                file_digest(stream, 'sha256').hexdigest()
+            sha256 = file_digest(stream, 'sha256').hexdigest()
+        parts = path.absolute().parts
+        for count in range(1, len(parts)):
+            if digests.setdefault('/'.join(parts[-count:]), sha256) == sha256:
+                break
     return digests
 
 

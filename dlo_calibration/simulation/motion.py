@@ -59,6 +59,7 @@ def densely(trial: Trial) -> Trial:
 
 
 def _frame_times(trial: Trial) -> list[float]:
+    """Return the times in a trial at which its motion is shown [s]."""
     last = max(max(hand.end for hand in trial.hands) + 1.0, trial.goals[-1].time)
     count = min(MOST_FRAMES, max(2, round(last * FRAME_RATE) + 1))
     return [float(time) for time in np.linspace(0.0, last, count)]

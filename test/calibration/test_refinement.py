@@ -198,7 +198,7 @@ def test_sessions_without_clamps_have_no_rest_shape_and_the_outcome_says_so(stif
 
 @pytest.mark.parametrize('option', [{'parts': 1}, {'names': ('damping',)}])
 def test_rest_shapes_of_sessions_that_nothing_would_choose_are_refused(stiff_middle, option):
-    with pytest.raises(InputError, match='own: rest_shape.*expected search least_squares'):
+    with pytest.raises(InputError, match='parameter own: rest_shape.*expected search least_squares'):
         calibrated(stiff_middle, 60, own=('rest_shape',), sessions='2 2', **option)
 
 

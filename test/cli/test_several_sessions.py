@@ -61,7 +61,7 @@ def test_the_passport_names_all_sessions_also_those_whose_files_have_the_same_na
     for path, session in zip(paths, sessions, strict=False):
         path.parent.mkdir()
         path.write_bytes(session.read_bytes())
-    assert fit(*paths, '--evaluations', '8', '--output', tmp_path / 'out')[0] == 0
+    assert fit(*paths, paths[0], '--evaluations', '8', '--output', tmp_path / 'out')[0] == 0
     assert read_result(tmp_path / 'out' / 'result.xml').passport.sessions == {
         name: sha256(path.read_bytes()).hexdigest()
         for name, path in zip(('session.mcap', 'second/session.mcap'), paths, strict=True)}

@@ -262,7 +262,7 @@ def node(tally: Tally, dice: random.Random, folder: Path) -> None:
         robot.until_status(trials='1')
         for _ in range(FLOOD):
             kind, octets = dice.choice(serialised('camera'))
-            # After no bytes at all, which no ROS publisher sends, Fast DDS loses all others of this one.
+            # No ROS message has no bytes; after such a one, Fast DDS delivers nothing more of its publisher.
             robot.publishers[kind].publish(mutated(octets, dice) or bytes(4))
             tally.tried += 1
             robot.executor.spin_once(timeout_sec=0.001)
