@@ -231,12 +231,22 @@ class Chain:
         :returns: the nearest point to it along the curve and its offset from there, see `grip_place`, and its
             distance from the position [m].
         """
-        _, along, samples = self._curve()
-        steps = np.diff(samples, axis=0)
-        shares = np.clip(((position - samples[:-1]) * steps).sum(axis=1) / (steps**2).sum(axis=1), 0.0, 1.0)
-        away = np.linalg.norm(samples[:-1] + shares[:, None] * steps - position, axis=1)
-        k = int(away.argmin())
-        return *self.grip(float(along[k] + shares[k] * (along[k + 1] - along[k]))), float(away[k])
+        knots, places = self._knots(), self.arc_lengths()
+        away = np.linalg.norm(self.points - position, axis=1)
+        # A place on a piece is no further from the piece's ends than the piece is long.
+        least = (away[:-1] + away[1:] - np.diff(places)) / 2
+        pieces = np.flatnonzero(least <= away.min() + MINIMUM_SPACING)
+        fractions = np.linspace(0.0, 1.0, SAMPLES_PER_SEGMENT + 1)
+        parameters = knots[pieces, None] + np.diff(knots)[pieces, None] * fractions
+        samples = bezier_curve(knots, self.points, parameters.ravel()).reshape(*parameters.shape, 3)
+        steps = np.diff(samples, axis=1)
+        shares = ((position - samples[:, :-1]) * steps).sum(axis=-1) / (steps**2).sum(axis=-1)
+        shares = np.clip(shares, 0.0, 1.0)
+        away = np.linalg.norm(samples[:, :-1] + shares[..., None] * steps - position, axis=-1)
+        row, k = np.unravel_index(away.argmin(), away.shape)
+        ways = np.linalg.norm(steps[row], axis=1)
+        place = places[pieces[row]] + ways[:k].sum() + shares[row, k] * ways[k]
+        return *self.grip(float(place)), float(away[row, k])
 
     def grip(self, place: float) -> tuple[int, float]:
         """

@@ -225,3 +225,13 @@ def test_the_place_nearest_to_a_position_lies_between_points(place):
     assert grip_place(chain.arc_lengths(), point, offset) == pytest.approx(place, abs=4e-3)
     np.testing.assert_allclose(chain.gripped((point,), offset)[0], at, atol=4e-3)
     assert chain.nearest(chain.points[4]) == (4, 0.0, pytest.approx(0.0, abs=1e-12))
+
+
+@given(chains(), st.tuples(*[st.floats(-3, 3)] * 3), st.sampled_from([0.01, 1.0]), st.floats(0, 1))
+def test_no_place_is_nearer_to_a_position_than_the_nearest_one(chain, away, scale, share):
+    position = chain.resample([share * chain.length])[0] + scale * np.array(away)
+    point, offset, distance = chain.nearest(position)
+    curve = chain.resample(np.linspace(0, chain.length, 2000))
+    assert distance == pytest.approx(np.linalg.norm(curve - position, axis=1).min(), abs=1e-4)
+    place = chain.gripped((point,), offset)[0]
+    assert np.linalg.norm(place - position) == pytest.approx(distance, abs=2e-3)
