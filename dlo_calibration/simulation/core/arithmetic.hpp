@@ -43,6 +43,41 @@ struct alignas(32) Mask {
 
 inline Lanes each(double x) { DLO_LANEWISE(Lanes, x - Vector{}); }
 
+// Lanes also hold four numbers of one DLO.
+
+inline Lanes four(double a, double b, double c, double d) {
+#ifdef DLO_AVX2
+  return {{Vector{a, b, c, d}}};
+#else
+  return {{Vector{a, b}, Vector{c, d}}};
+#endif
+}
+inline Lanes four(const double* numbers) {
+  Lanes result;
+  __builtin_memcpy(&result, numbers, sizeof result);
+  return result;
+}
+
+inline void store(Lanes a, double* numbers) { __builtin_memcpy(numbers, &a, sizeof a); }
+
+/// The numbers 1, 2 and 3 of `a`, and 0.
+inline Lanes moved(Lanes a) {
+#ifdef DLO_AVX2
+  return {{__builtin_shufflevector(a.of[0], Vector{}, 1, 2, 3, 4)}};
+#else
+  return {{__builtin_shufflevector(a.of[0], a.of[1], 1, 2), __builtin_shufflevector(a.of[1], Vector{}, 1, 2)}};
+#endif
+}
+
+/// The numbers 1 and 2 of `a`, number 0 of `b`, and number 3 of `a`.
+inline Lanes moved(Lanes a, Lanes b) {
+#ifdef DLO_AVX2
+  return {{__builtin_shufflevector(a.of[0], b.of[0], 1, 2, 4, 3)}};
+#else
+  return {{__builtin_shufflevector(a.of[0], a.of[1], 1, 2), __builtin_shufflevector(b.of[0], a.of[1], 0, 3)}};
+#endif
+}
+
 #define DLO_OPERATOR(symbol, Result)                                                                \
   inline Result operator symbol(Lanes a, Lanes b) { DLO_LANEWISE(Result, a.of[k] symbol b.of[k]); } \
   inline Result operator symbol(Lanes a, double b) { return a symbol each(b); }                     \

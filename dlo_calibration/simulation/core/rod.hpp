@@ -36,7 +36,7 @@ namespace DLO_TARGET {
 
 constexpr double kHeld = 1e12;  // weight of the equation of a held node, relative to its mass
 
-/// Compute the springs of all segments in one loop, so that roots and divisions pipeline.
+/// Compute the springs of all segments; those of one DLO four at a time, as roots and divisions take long.
 template <class Number>
 inline void find_springs(Rods<Number>& rods) {
   const int segments = rods.nodes - 1;
@@ -49,16 +49,35 @@ inline void find_springs(Rods<Number>& rods) {
   auto* springs = rods.springs.data();
   auto* tangents = rods.tangents.data();
   auto* inverse_lengths = rods.inverse_lengths.data();
-  for (int i = 0; i < segments; ++i) {
-    const Vec3<Number> segment = points[i + 1] - points[i];
-    const Number inverse = 1.0 / sqrt(dot(segment, segment)), stiffness = stiffnesses[i];
-    const Number slack = 1.0 - rest_lengths[i] * inverse;
-    const Number across = max(slack, 0.0) * stiffness;
-    const Number taut = min(across * (step * step) / min(masses[i], masses[i + 1]), 1.0);
-    const Number part = implicit + taut * missing;
-    springs[i] = {across * part, part * (stiffness - across) * inverse * inverse,
-                  stiffness * slack * step, across * part * min(2.0 - 2.0 * taut, 1.0)};
-    if (framed) tangents[i] = inverse * segment, inverse_lengths[i] = inverse;
+  const auto spring = [&](auto inverse, auto rest_length, auto stiffness, auto mass) {
+    using Result = decltype(inverse);
+    const Result slack = 1.0 - rest_length * inverse;
+    const Result across = max(slack, 0.0) * stiffness;
+    const Result taut = min(across * (step * step) / mass, 1.0);
+    const Result part = implicit + taut * missing;
+    return Spring<Result>{across * part, part * (stiffness - across) * inverse * inverse,
+                          stiffness * slack * step, across * part * min(2.0 - 2.0 * taut, 1.0)};
+  };
+  const auto segment = [&](int i) { return points[i + 1] - points[i]; };
+  const auto square = [&](int i) { return dot(segment(i), segment(i)); };
+  const auto put = [&](int i, const Spring<Number>& found, Number inverse) {
+    springs[i] = found;
+    if (framed) tangents[i] = inverse * segment(i), inverse_lengths[i] = inverse;
+  };
+  int i = 0;
+  if constexpr (lanes_of<Number> == 1) {
+    for (; i + 4 <= segments; i += 4) {
+      Lanes inverses = 1.0 / sqrt(four(square(i), square(i + 1), square(i + 2), square(i + 3)));
+      auto [across, along, impulse, returned] = spring(inverses, four(rest_lengths + i), four(stiffnesses + i),
+                                                       min(four(masses + i), four(masses + i + 1)));
+      for (int k = 0; k < 4; ++k)
+        put(i + k, {in_lane(across, k), in_lane(along, k), in_lane(impulse, k), in_lane(returned, k)},
+            in_lane(inverses, k));
+    }
+  }
+  for (; i < segments; ++i) {
+    const Number inverse = 1.0 / sqrt(square(i));
+    put(i, spring(inverse, rest_lengths[i], stiffnesses[i], min(masses[i], masses[i + 1])), inverse);
   }
 }
 
@@ -68,21 +87,97 @@ inline void push_front(std::array<Number, kBand>& last, Number value) {
   last[1] = value;
 }
 
-/// Subtract from a column and its right side the share of the column that is `Back` columns before it.
-template <int Back, class Number>
-inline void eliminate(const Column<Number>& done, const std::array<Number, kBand>& last,
-                      Column<Number>& column, Number& value) {
-  const Number share = done[Back] * done[0];
-  for (int m = 0; m + Back < kBand; ++m) column[m] = column[m] - share * done[Back + m];
-  value = value - share * last[Back];
-}
+/// The elimination of the columns of four DLOs.  Each one is computed in one pass from the six before it.  The last
+/// one stays in registers, so that the next pivot never waits for memory.
+template <class Number>
+class Elimination {
+ public:
+  explicit Elimination(Column<Number>* columns) : columns_(columns) {}
+
+  /// Eliminate the next column, with its right side `value`; write that of L^T to `result`.
+  template <class... Entries>
+  void add(Number& result, Number value, Entries... entries) {
+    Column<Number> column{{entries...}};
+    subtract<6>(columns_[-6], column, value);
+    subtract<5>(columns_[-5], column, value);
+    subtract<4>(columns_[-4], column, value);
+    subtract<3>(columns_[-3], column, value);
+    subtract<2>(columns_[-2], column, value);
+    subtract<1>(done_, column, value);
+    smallest = min(smallest, column[0]);
+    column[0] = 1.0 / column[0];
+    push_front(last_, value);
+    result = value * column[0];
+    *columns_++ = done_ = column;
+  }
+
+  /// The entry of L in the row that is `rows` below the diagonal.
+  static Number factor(const Column<Number>& column, int rows) { return column[rows] * column[0]; }
+
+  Number smallest = Number{} + HUGE_VAL;  // pivot
+
+ private:
+  /// Subtract the share of the column that is `Back` columns before.
+  template <int Back>
+  void subtract(const Column<Number>& done, Column<Number>& column, Number& value) {
+    const Number share = done[Back] * done[0];
+    for (int m = 0; m + Back < kBand; ++m) column[m] = column[m] - share * done[Back + m];
+    value = value - share * last_[Back];
+  }
+
+  Column<Number>* columns_;
+  Column<Number> done_{};
+  std::array<Number, kBand> last_{};  // right sides, from 1 on
+};
+
+/// That of one DLO, to the same bits.  The last six columns stay in registers, and move up by a row with each
+/// column.  A column lies in two: its next three entries and its right side in `top`, the four below in `low`.
+template <>
+class Elimination<double> {
+ public:
+  explicit Elimination(Column<double>* columns) : columns_(columns) {}
+
+  void add(double& result, double value, double a, double b, double c, double d, double e, double f, double g) {
+    Lanes top = four(a, b, c, value), low = four(d, e, f, g);
+    subtract<6>(top, low);
+    subtract<5>(top, low);
+    subtract<4>(top, low);
+    subtract<3>(top, low);
+    subtract<2>(top, low);
+    // The next pivot waits for this one, but not for the other entries.
+    const double pivot = in_lane(top, 0) - share_ * in_lane(tops_[1], 0), inverse = 1.0 / pivot;
+    top = top - share_ * tops_[1], low = low - share_ * lows_[1];
+    smallest = min(smallest, pivot);
+    const Lanes factors = inverse * top;
+    store(factors, &(*columns_)[0]), store(inverse * low, &(*columns_)[4]);
+    result = (*columns_++)[3];
+    for (int k = 6; k > 1; --k) tops_[k] = moved(tops_[k - 1], lows_[k - 1]);
+    for (int k = 3; k > 1; --k) lows_[k] = moved(lows_[k - 1]);
+    tops_[1] = moved(top, low), lows_[1] = moved(low);
+    share_ = in_lane(tops_[1], 0) * inverse;
+  }
+
+  static double factor(const Column<double>& column, int rows) { return column[rows < 3 ? rows : rows + 1]; }
+
+  double smallest = HUGE_VAL;  // pivot
+
+ private:
+  template <int Back>
+  void subtract(Lanes& top, Lanes& low) const {
+    const double share = factor(columns_[-Back], Back);
+    top = top - share * tops_[Back];
+    if constexpr (Back < 4) low = low - share * lows_[Back];
+  }
+
+  Column<double>* columns_;
+  std::array<Lanes, kBand> tops_{}, lows_{};  // by how many columns they are back; `lows_` is 0 from 4 on
+  double share_ = 0.0;                        // of the last column in the next one
+};
 
 /// Write the equations of a step and solve them by L D L^T (Golub and Van Loan, Matrix Computations, 4.3).
 ///
 /// `strand_forces` and `frame_impulses` add the other internal forces, `holding` holds nodes, `touching` keeps
-/// them out of bodies.  The solution
-/// is written to `predicted`, and whether it is finite to `solved`.  Each column is computed in one pass from
-/// the six before it.  The last one stays in registers, so that the next pivot never waits for memory.
+/// them out of bodies.  The solution is written to `predicted`, and whether it is finite to `solved`.
 template <class Number>
 inline void solve(Rods<Number>& rods) {
   const int n = rods.nodes;
@@ -98,40 +193,24 @@ inline void solve(Rods<Number>& rods) {
   const auto* holdings = rods.holding.data();
   const auto *any_held = rods.any_held.data(), *any_touching = rods.any_touching.data();
   auto* predicted = rods.predicted.data();
-  Column<Number>* columns = rods.columns.data() + kBand - 1;
+  Elimination<Number> elimination(rods.columns.data() + kBand - 1);
   const Point fall = step * rods.gravity;
   const Number none{};
-  Number smallest = none + HUGE_VAL;  // pivot
-  Column<Number> done{};              // the last column
-  std::array<Number, kBand> last{};   // last values of the right side, from 1 on
-  const auto next = [&](Number& result, Number value, auto... entries) {
-    Column<Number> column;
-    int count = 0;
-    ((column[count++] = entries), ...);
-    eliminate<6>(columns[-6], last, column, value);
-    eliminate<5>(columns[-5], last, column, value);
-    eliminate<4>(columns[-4], last, column, value);
-    eliminate<3>(columns[-3], last, column, value);
-    eliminate<2>(columns[-2], last, column, value);
-    eliminate<1>(done, last, column, value);
-    smallest = min(smallest, column[0]);
-    column[0] = 1.0 / column[0];
-    push_front(last, value);
-    result = value * column[0];
-    *columns++ = done = column;
-  };
   Number xx = none, yy = none, zz = none, xy = none, xz = none, yz = none;  // of the segment before
   Vec3<Number> before{};                                                    // its impulse
   const auto bent = [&](int k) { return step * points[k] - surplus * velocities[k]; };  // what bending resists
+  Vec3<Number> bents[5] = {{}, {}, {}, bent(0), bent(1)};  // of nodes i - 2 to i + 2
   for (int i = 0; i < n; ++i) {
-    Vec3<Number> unbending = bending[i][0] * bent(i), segment{}, apart{};
+    for (int k = 0; k < 4; ++k) bents[k] = bents[k + 1];
+    if (i + 2 < n) bents[4] = bent(i + 2);
+    Vec3<Number> unbending = bending[i][0] * bents[2], segment{}, apart{};
     if (i + 1 < n) {
       segment = points[i + 1] - points[i], apart = velocities[i + 1] - velocities[i];
-      unbending = unbending + bending[i][1] * bent(i + 1);
+      unbending = unbending + bending[i][1] * bents[3];
     }
-    if (i + 2 < n) unbending = unbending + bending[i][2] * bent(i + 2);
-    if (i > 0) unbending = unbending + bending[i - 1][1] * bent(i - 1);
-    if (i > 1) unbending = unbending + bending[i - 2][2] * bent(i - 2);
+    if (i + 2 < n) unbending = unbending + bending[i][2] * bents[4];
+    if (i > 0) unbending = unbending + bending[i - 1][1] * bents[1];
+    if (i > 1) unbending = unbending + bending[i - 2][2] * bents[0];
     const Number mass = masses[i];
     Vec3<Number> impulse = mass * (velocities[i] + fall) - unbending;
     Number diagonal = mass * (1.0 + drag * step) + implicit * bending[i][0];
@@ -151,7 +230,6 @@ inline void solve(Rods<Number>& rods) {
     xy = spring.along * x * y, xz = spring.along * x * z, yz = spring.along * y * z;
     before = spring.impulse * segment - spring.returned * apart;
     impulse = impulse + before;
-    Vec3<Number>& result = predicted[i];
     Number dx = ax + xx, dy = ay + yy, dz = az + zz;
     if (framed) impulse = impulse + frame_impulses[i];
     if (any_held[i]) {
@@ -169,23 +247,23 @@ inline void solve(Rods<Number>& rods) {
       nyy = nyy + next_node[3], nyz = nyz + next_node[4], nzz = nzz + next_node[5];
       impulse = impulse + push;
     }
-    next(result.x, impulse.x, dx, dxy, dxz, nxx, nxy, nxz, second);
-    next(result.y, impulse.y, dy, dyz, nxy, nyy, nyz, none, second);
-    next(result.z, impulse.z, dz, nxz, nyz, nzz, none, none, second);
+    elimination.add(predicted[i].x, impulse.x, dx, dxy, dxz, nxx, nxy, nxz, second);
+    elimination.add(predicted[i].y, impulse.y, dy, dyz, nxy, nyy, nyz, none, second);
+    elimination.add(predicted[i].z, impulse.z, dz, nxz, nyz, nzz, none, none, second);
   }
   Number total = none;
-  last = {};
+  const Column<Number>* column = rods.columns.data() + kBand - 1 + 3 * n;
+  std::array<Number, kBand> last{};  // numbers of the solution, from 1 on
   const auto back = [&](Number& result) {
-    const Column<Number>& column = *--columns;
-    const Number inverse = column[0];
+    --column;
     Number value = result;
-    for (int k = kBand - 1; k > 0; --k) value = value - column[k] * inverse * last[k];
+    for (int k = kBand - 1; k > 0; --k) value = value - Elimination<Number>::factor(*column, k) * last[k];
     push_front(last, value);
     total = total + value;
     result = value;
   };
   for (int i = n - 1; i >= 0; --i) back(predicted[i].z), back(predicted[i].y), back(predicted[i].x);
-  rods.solved = select(finite(total) & (smallest > 0.0), none + 1.0, none);
+  rods.solved = select(finite(total) & (elimination.smallest > 0.0), none + 1.0, none);
 }
 
 /// Compute the tensions that the springs transmit in a step, as its equations have them: the force of the

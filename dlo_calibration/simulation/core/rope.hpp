@@ -16,9 +16,10 @@ namespace dlo {
 
 constexpr int kBand = 7;  // entries per column of the lower triangle: node i is coupled with node i + 2
 
-/// A column of the factors L D L^T of a step's equations: the inverse of D, and below it L D.
+/// A column of the factors L D L^T of a step's equations.  Of four DLOs, it is the inverse of D, and below it L D;
+/// of one, it is L, in the order of `Elimination`.
 template <class Number>
-using Column = std::array<Number, kBand>;
+struct alignas(32) Column : std::array<Number, (lanes_of<Number> > 1) ? kBand : kBand + 1> {};
 
 /// What a hand adds to the equation of a node that it holds.
 template <class Number>
