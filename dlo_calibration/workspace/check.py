@@ -26,7 +26,7 @@ from dlo_calibration.inference.uncertainty import IDENTIFIABLE_WIDTH
 from dlo_calibration.model.parameters import BY_NAME, extents, interval, measured, number, SCALE
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.search import Hints, LeastSquares
-from dlo_calibration.workspace.validation import FURTHER, SAME, validated
+from dlo_calibration.workspace.validation import FURTHER, others_own, SAME, validated
 
 AGREES, HAS_CHANGED, CANNOT_TELL = 'agrees', 'changed', 'cannot tell'
 ANOTHER_LENGTH = 0.05  # share by which the length of the same DLO never differs, however it is measured
@@ -38,16 +38,17 @@ class Check:
     Whether a session shows the DLO of a result.
 
     :param validation: the session, simulated with the parameters of the result.
-    :param comparison: of the parameters that fit the session with those of the result, in the order of
-        `validation.space.free`; None: there is none.
+    :param comparison: of the parameters that fit the session with those of the result; None: there is none.
     :param verdict: agrees, changed, or cannot tell.
     :param words: why, in one or more sentences.
+    :param names: of the parameters that were compared, in order.
     """
 
     validation: CalibrationResult
     comparison: Comparison | None
     verdict: str
     words: tuple[str, ...]
+    names: tuple[str, ...] = ()
 
 
 def checked(file: Description, trials: Sequence[Trial], options: Options,
@@ -57,6 +58,7 @@ def checked(file: Description, trials: Sequence[Trial], options: Options,
     Compare the parameters that fit new trials with those of a result.
 
     The search begins at the result, among other points: what the new trials do not show stays as it is.
+    What each session of the calibration has for itself, as the friction of its table, may be another one.
 
     :raises InputError: if the hands have lost the DLO in all trials.
     :raises SimulationError: if a trial cannot be simulated with the parameters of the result.
@@ -84,9 +86,16 @@ def checked(file: Description, trials: Sequence[Trial], options: Options,
         return Check(validation, None, CANNOT_TELL, (
             f'Nothing can be compared: the search has not reached a minimum ({there.stop_reason}).',))
     assert there.best.errors is not None and there.examination.uncertainty.covariance is not None
-    comparison = compare(there.best.point - point, covariance(file, space.free),
-                         there.examination.uncertainty.covariance)
-    return Check(validation, comparison, *_judged(file, validation, comparison, there.best.errors.mean))
+    own = others_own(file.space, trials)
+    names = tuple(name for name in space.free if name not in own)
+    if not names:
+        return Check(validation, None, CANNOT_TELL, (
+            f'Nothing can be compared: each session has its own {" and ".join(own)}.',))
+    kept = [space.free.index(name) for name in names]
+    comparison = compare((there.best.point - point)[kept], covariance(file, names),
+                         there.examination.uncertainty.covariance[np.ix_(kept, kept)])
+    return Check(validation, comparison, *_judged(
+        file, validation, names, comparison, there.best.errors.mean), names)
 
 
 def covariance(file: Description, names: Sequence[str]) -> Any:
@@ -98,20 +107,21 @@ def covariance(file: Description, names: Sequence[str]) -> Any:
     return np.where(np.isfinite(correlations), correlations, np.eye(len(names))) * np.outer(std, std)
 
 
-def _judged(file: Description, validation: CalibrationResult, comparison: Comparison, error: float
-            ) -> tuple[str, tuple[str, ...]]:
+def _judged(file: Description, validation: CalibrationResult, names: Sequence[str], comparison: Comparison,
+            error: float) -> tuple[str, tuple[str, ...]]:
     """
     Return the verdict, and sentences on it.
 
+    :param names: of the parameters that were compared.
     :param error: mean point error of the parameters that fit the session best [m].
     """
-    names, length = validation.space.free, validation.length
+    length = validation.length
     if error > max(FURTHER * file.errors.mean, SAME * length):
         return HAS_CHANGED, (
             'No parameter explains this session: at best, the simulated points are '
             f'{measured(error, "m")} from the measured ones, {measured(file.errors.mean, "m")} '
             'in the calibration. It is another DLO or frame, or a hand slipped.',)
-    changes = _changes(file, validation, comparison)
+    changes = _changes(file, validation, names, comparison)
     sure = 'less than 0.01 %' if comparison.agreement < 1e-4 else f'{number(100 * comparison.agreement)} %'
     chance = f'The same DLO would differ by as much in {sure} of such sessions.'
     if comparison.changed.any():
@@ -127,12 +137,12 @@ def _judged(file: Description, validation: CalibrationResult, comparison: Compar
     return AGREES, (chance, *known)
 
 
-def _changes(file: Description, validation: CalibrationResult, comparison: Comparison) -> list[str]:
+def _changes(file: Description, validation: CalibrationResult, names: Sequence[str],
+             comparison: Comparison) -> list[str]:
     """Return a sentence on the change of each parameter."""
     words = []
     for name, change, lower, upper, changed in zip(
-            validation.space.free, comparison.change, comparison.lower, comparison.upper, comparison.changed,
-            strict=True):
+            names, comparison.change, comparison.lower, comparison.upper, comparison.changed, strict=True):
         before, scale = file.parameters[name], SCALE / BY_NAME[name].extent
         now, *ends = (validation.space.reported(name, float(np.clip(before.value + scale * by, 0, SCALE)))[0]
                       for by in (change, lower, upper))
@@ -152,7 +162,7 @@ def plain_check(check: Check) -> Mapping[str, Any]:
     `lower` and `upper` of a parameter are those of its change, where it was compared.
     """
     comparison, values = check.comparison, plain(check.validation)
-    for k, name in enumerate(check.validation.space.free if comparison is not None else ()):
+    for k, name in enumerate(check.names):
         assert comparison is not None
         change, lower, upper = (SCALE / BY_NAME[name].extent * float(each[k]) for each in (
             comparison.change, comparison.lower, comparison.upper))

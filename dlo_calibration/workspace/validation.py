@@ -22,7 +22,15 @@ from dlo_calibration.evaluation.evaluation import Evaluator
 from dlo_calibration.evaluation.pool import Pool, Threads
 from dlo_calibration.files.result import Description
 from dlo_calibration.inference.outlier import SOMETHING_ELSE, SURELY
-from dlo_calibration.model.parameters import BY_NAME, measured, number, ParameterSpace
+from dlo_calibration.model.parameters import (
+    BY_NAME,
+    measured,
+    number,
+    OWN_SHAPE,
+    owner,
+    ParameterSpace,
+    REST_SHAPE,
+)
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.grips import GripEvidence
 from dlo_calibration.observation.material import with_shared_places
@@ -47,6 +55,9 @@ def validated(file: Description, trials: Sequence[Trial], options: Options,
     evidence = GripEvidence.of(trials)
     trials = with_shared_places(evidence.require_usable(trials))
     space, hands = _with_errors(evidence, file)
+    own = others_own(space, trials)
+    space = replace(space, free=tuple(
+        name for name in space.free if not owner(name)[1] or owner(name)[0] not in own))
     point = space.point(file.values)
     with closing(make_simulator(options)) as simulator, closing(Threads(options.workers)) as threads:
         begun = time.monotonic()
@@ -56,7 +67,9 @@ def validated(file: Description, trials: Sequence[Trial], options: Options,
     if evaluation.failure:
         raise SimulationError(evaluation.failure)
     implausible = implausible_trials(trials, options.table_top, bool(options.scene))
-    warnings = (*implausible, *hands, *(f'never came to rest: {name}; the last state was compared'
+    first = (f'{name}: each session of the calibration has one of its own; that of the first is used'
+             for name in dict.fromkeys(OWN_SHAPE if name in REST_SHAPE else name for name in own))
+    warnings = (*implausible, *hands, *first, *(f'never came to rest: {name}; the last state was compared'
                                         for name in evaluation.unsettled))
     result = CalibrationResult(
         space=space, estimates={name: file.parameters[name] for name in space.free}, best=evaluation,
@@ -70,6 +83,13 @@ def validated(file: Description, trials: Sequence[Trial], options: Options,
             f'the mean error is {number(mean / of_fit)} times that of the calibration, '
             f'{measured(of_fit, "m")}; check whether this is the same DLO, in the same frame'))
     return result
+
+
+def others_own(space: ParameterSpace, trials: Sequence[Trial]) -> tuple[str, ...]:
+    """Return the parameters of which other sessions than those of the trials have values of their own."""
+    sessions = {trial.session for trial in trials}
+    return tuple(dict.fromkeys(name for name, session in map(owner, space.free)
+                               if session and session not in sessions))
 
 
 def _with_errors(evidence: GripEvidence, file: Description) -> tuple[ParameterSpace, tuple[str, ...]]:

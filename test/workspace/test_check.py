@@ -81,6 +81,31 @@ def test_false_alarms_and_changes_that_are_missed_are_rare():
         assert sum(each == (HAS_CHANGED, [name]) for each in verdicts(**{name: factor})) >= 90
 
 
+@cache
+def result_of_two_tables():
+    """Return the result for a session on each of two tables."""
+    other = [replace(trial, session=2) for trial in session(1, friction=1.3)]
+    options = Options(workers=1, own=('friction',), sessions='3 3')
+    return Description.of(fitted(Setting((*session(0), *other), options, ToySimulator())))
+
+
+def test_what_sessions_have_for_themselves_may_change():
+    file = result_of_two_tables()
+    assert 'friction_session_2' in file.parameters
+    found = check(session(7, friction=0.8), file)
+    assert found.verdict == AGREES
+    assert not any('friction' in words for words in found.words)
+    assert any('friction: each session' in warning for warning in found.validation.warnings)
+    assert named(check(session(7, friction=0.8, flexibility=1.25), file)) == ['flexibility']
+
+
+def test_the_session_of_two_tables_has_the_values_of_both():
+    other = [replace(trial, session=2) for trial in session(1, friction=1.3)]
+    validation = check((*session(0), *other), result_of_two_tables()).validation
+    assert 'friction_session_2' in validation.space.free
+    assert not any('friction' in warning for warning in validation.warnings)
+
+
 def test_another_length_is_another_dlo():
     longer = [replace(trial, initial=Chain(1.3 * trial.initial.points)) for trial in session(8)]
     found = check(longer)
