@@ -71,8 +71,9 @@ setup(
             '-std=c++17', '-O3', '-g0', '-fvisibility=hidden', '-Wno-psabi',
             # The same bits on every processor: no fused or reordered operations.
             '-ffp-contract=off', '-fno-math-errno', '-fno-trapping-math',
-            # GCC 12 vectorizes to fused operations in spite of the above; lanes are vectors already.
-            '-fno-tree-vectorize',
+            # GCC 12 vectorizes to fused operations in spite of the above; lanes are vectors already, and what
+            # Clang makes into vectors besides waits for memory.
+            '-fno-tree-vectorize', '-fno-tree-slp-vectorize',
             *MORE_FLAGS])],
     zip_safe=False,
     python_requires='>=3.11',

@@ -83,8 +83,7 @@ inline void find_springs(Rods<Number>& rods) {
 
 template <class Number>
 inline void push_front(std::array<Number, kBand>& last, Number value) {
-  for (int k = kBand - 1; k > 1; --k) last[k] = last[k - 1];
-  last[1] = value;
+  last = {{value, value, last[1], last[2], last[3], last[4], last[5]}};
 }
 
 /// The elimination of the columns of four DLOs.  Each one is computed in one pass from the six before it.  The last
