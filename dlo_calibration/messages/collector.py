@@ -75,6 +75,7 @@ USED = (*names_of(OBSERVATION), 'stable_distance', 'stable_time', 'settle_limit'
 KEPT = 10_000  # messages that no trial uses: more than 5 minutes of a tracker at 30 Hz
 LATE = NANOSECONDS  # that goal chains from before the first initial chain may come late [ns]
 RECENT = 3  # trials before a new one that are compared with it
+MOST_HANDS = 200  # of these, whose grips are looked at while messages arrive: a second, with long streams
 MOST_MESSAGES = 200_000  # nearly two hours of a tracker at 30 Hz, which take about 450 MB
 MOST_NUMBERS = 20_000_000  # coordinates in them, which take 160 MB
 
@@ -225,9 +226,11 @@ class TrialCollector:
                 before = in_order(other, before)
             wrong = (*implausible(trial, options.table_top, bool(options.scene), before),
                      *repeated(trial, earlier))
-        if builder.lost or trial.goals[-1].time < trial.hands[-1].end:
+        recent = (*earlier, trial)
+        if builder.lost or trial.goals[-1].time < trial.hands[-1].end \
+                or sum(len(each.hands) for each in recent) > MOST_HANDS:
             return wrong, ()
-        evidence = GripEvidence.of((*earlier, trial))
+        evidence = GripEvidence.of(recent)
         if not self._hands_seen and (texts := hand_warnings(evidence, options)):
             self._hands_seen = True
             self._warnings += texts
