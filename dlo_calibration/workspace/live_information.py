@@ -76,19 +76,15 @@ class LiveInformation(Background[Any]):
         """
         if not whole and trials and not trials[-1].goals[-1].stable:
             trials = trials[:-1]
-        options = choose(trials, options).options
-        if result is not None and result.space != options.space:
-            result = None
-        if self._base is None or self._base[0] != options or self._base[1] is not result:
-            self._base, self._appraisals = (options, result), {}
-        appraisals, put = self._appraisals, self.events.put
+        put = self.events.put
 
         def work(should_stop: Callable[[], bool]) -> None:
             try:
-                appraised = appraise(self._make_simulator, tuple(trials), options, result, appraisals, put,
-                                     should_stop)
+                chosen = choose(trials, options).options  # takes a second for long streams
+                appraised = appraise(self._make_simulator, tuple(trials), chosen,
+                                     *self._known(chosen, result), put, should_stop)
                 if then is not None:
-                    put(then(appraised, options, should_stop))
+                    put(then(appraised, chosen, should_stop))
             except CancelledError:
                 pass
             except Exception as error:  # an appraisal never disturbs the node
@@ -96,6 +92,15 @@ class LiveInformation(Background[Any]):
                                              one_line(error)))
 
         self.begin(work)
+
+    def _known(self, options: Options, result: CalibrationResult | None
+               ) -> tuple[CalibrationResult | None, _Appraisals]:
+        """Return the last result, unless it has other parameters, and the appraisals that count with it."""
+        if result is not None and result.space != options.space:
+            result = None
+        if self._base is None or self._base[0] != options or self._base[1] is not result:
+            self._base, self._appraisals = (options, result), {}
+        return result, self._appraisals
 
     def stop(self) -> None:
         """End the appraisal under way, delete its results, and return immediately."""
