@@ -12,7 +12,7 @@ import pytest
 from random_examples import drawing
 
 from dlo_calibration import Chain, Goal, Hand, InputError
-from dlo_calibration.model.chain import bezier_curve, grip_place, interpolation_matrix
+from dlo_calibration.model.chain import bezier_curve, grip_place, interpolation_matrix, NEAR
 
 LINE = np.array([[0, 0, 0], [0.1, 0, 0], [0.25, 0, 0], [0.3, 0, 0], [0.6, 0, 0]])
 
@@ -232,6 +232,6 @@ def test_no_place_is_nearer_to_a_position_than_the_nearest_one(chain, away, scal
     position = chain.resample([share * chain.length])[0] + scale * np.array(away)
     point, offset, distance = chain.nearest(position)
     curve = chain.resample(np.linspace(0, chain.length, 2000))
-    assert distance == pytest.approx(np.linalg.norm(curve - position, axis=1).min(), abs=1e-4)
+    assert distance == pytest.approx(np.linalg.norm(curve - position, axis=1).min(), abs=chain.length / 500)
     place = chain.gripped((point,), offset)[0]
-    assert np.linalg.norm(place - position) == pytest.approx(distance, abs=2e-3)
+    assert np.linalg.norm(place - position) < distance + 1.5 * NEAR * np.diff(chain.arc_lengths()).max()
