@@ -233,7 +233,7 @@ class Chain:
         """
         knots, places = self._knots(), self.arc_lengths()
         away = np.linalg.norm(self.points - position, axis=1)
-        # A place on a piece is no further from the piece's ends than the piece is long.
+        # From a place on a piece, the ways to both of its ends are together as long as the piece.
         least = (away[:-1] + away[1:] - np.diff(places)) / 2
         pieces = np.flatnonzero(least <= away.min() + MINIMUM_SPACING)
         fractions = np.linspace(0.0, 1.0, SAMPLES_PER_SEGMENT + 1)
