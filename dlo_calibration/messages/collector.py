@@ -75,7 +75,7 @@ USED = (*names_of(OBSERVATION), 'stable_distance', 'stable_time', 'settle_limit'
 KEPT = 10_000  # messages that no trial uses: more than 5 minutes of a tracker at 30 Hz
 LATE = NANOSECONDS  # that goal chains from before the first initial chain may come late [ns]
 RECENT = 3  # trials before a new one that are compared with it
-MOST_HANDS = 200  # of these, whose grips are looked at while messages arrive: a second, with long streams
+MOST_HANDS = 200  # in all of these; with more, looking at their grips takes longer than messages may wait
 MOST_MESSAGES = 200_000  # nearly two hours of a tracker at 30 Hz, which take about 450 MB
 MOST_NUMBERS = 20_000_000  # coordinates in them, which take 160 MB
 

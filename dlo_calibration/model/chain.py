@@ -220,7 +220,7 @@ class Chain:
 
     def resample(self, arc_lengths: ArrayLike) -> Floats:
         """Return the points of the curve, (m, 3) [m], at the given arc lengths, (m,) [m]."""
-        parameters, along, _ = self._curve()
+        parameters, along = self._arc_length_table()
         at = np.interp(np.asarray(arc_lengths, dtype=float), along, parameters)
         return bezier_curve(self._knots(), self.points, at)
 
@@ -270,20 +270,20 @@ class Chain:
 
     @cached_property
     def _places(self) -> Floats:
-        return frozen_array(self._curve()[1][::SAMPLES_PER_SEGMENT])
+        return frozen_array(self._arc_length_table()[1][::SAMPLES_PER_SEGMENT])
 
     def _knots(self) -> Floats:
         chords = np.linalg.norm(np.diff(self.points, axis=0), axis=1)
         return np.concatenate([[0.0], np.cumsum(chords)])
 
-    def _curve(self) -> tuple[Floats, Floats, Floats]:
-        """Return parameters of the curve, and the arc length [m] and the point (3,) [m] at each of them."""
+    def _arc_length_table(self) -> tuple[Floats, Floats]:
+        """Return parameters of the curve, and the arc length [m] at each of them."""
         knots = self._knots()
         fractions = np.arange(SAMPLES_PER_SEGMENT) / SAMPLES_PER_SEGMENT
         parameters = np.append((knots[:-1, None] + np.diff(knots)[:, None] * fractions).ravel(), knots[-1])
         samples = bezier_curve(knots, self.points, parameters)
         steps = np.linalg.norm(np.diff(samples, axis=0), axis=1)
-        return parameters, np.concatenate([[0.0], np.cumsum(steps)]), samples
+        return parameters, np.concatenate([[0.0], np.cumsum(steps)])
 
 
 def grip_place(places: Floats, point: int, offset: float) -> float:

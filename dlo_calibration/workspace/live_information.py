@@ -80,9 +80,10 @@ class LiveInformation(Background[Any]):
 
         def work(should_stop: Callable[[], bool]) -> None:
             try:
-                chosen = choose(trials, options).options  # takes a second for long streams
+                evidence = GripEvidence.of(trials)  # takes a second for long streams
+                chosen = choose(trials, options, evidence).options
                 appraised = appraise(self._make_simulator, tuple(trials), chosen,
-                                     *self._known(chosen, result), put, should_stop)
+                                     *self._known(chosen, result), put, should_stop, evidence)
                 if then is not None:
                     put(then(appraised, chosen, should_stop))
             except CancelledError:
@@ -139,7 +140,8 @@ class Appraised:
 def appraise(make_simulator: SimulatorFactory, trials: Sequence[Trial], options: Options,
              result: CalibrationResult | None = None, appraisals: _Appraisals | None = None,
              put: Callable[[Any], None] = lambda _: None,
-             should_stop: Callable[[], bool] = lambda: False) -> Appraised:
+             should_stop: Callable[[], bool] = lambda: False,
+             evidence: GripEvidence | None = None) -> Appraised:
     """
     Appraise the trials that are new, one after another.
 
@@ -147,6 +149,7 @@ def appraise(make_simulator: SimulatorFactory, trials: Sequence[Trial], options:
     :param result: of a calibration, whose trials are not appraised again; None: there is none.
     :param appraisals: those so far, to which the new ones are added.
     :param put: called with the information that each new trial adds.
+    :param evidence: what the trials show of the hands, if it is known already.
     :raises CancelledError: when stopped.
     """
     appraisals = {} if appraisals is None else appraisals
@@ -157,7 +160,7 @@ def appraise(make_simulator: SimulatorFactory, trials: Sequence[Trial], options:
     done = fingerprints(result.trials) if result and examination and examination.regular else []
     keys = fingerprints(trials)
     new = [(k, tuple(keys[:k + 1])) for k, key in enumerate(keys) if key not in done]
-    evidence = GripEvidence.of(trials)
+    evidence = evidence or GripEvidence.of(trials)
     lost = {loss.trial: str(loss) for loss in evidence.losses}
     usable = {trial.name: trial for trial in evidence.usable(trials)}
     hands = {name: getattr(options, name) for name in HANDS}
